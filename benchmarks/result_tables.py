@@ -99,8 +99,8 @@ _HEADLINE = (
     "objects, {} in piles of 15; {} and {} of the objects reach the tray."
 )
 _AHEAD = (
-    "On 15 objects{} the success of `graspnet` minus that of `heuristic` is {} points (95 % bootstrap, paired "
-    "by scene)."
+    "On 15 objects{} the success of `graspnet` minus that of `heuristic` is {} points (95 % "
+    "bootstrap, paired by scene)."
 )
 CHINESE = {
     "planner": "规划器",

@@ -22,6 +22,7 @@ from envs.robot_kinematics import JOINT_LOWER, JOINT_UPPER, tip_position
 from envs.robot_safety import ArmGate
 from envs.views import side_view
 from utils.config import CameraConfig, Config
+from utils.config_types import changed_in
 from utils.depth import seeded_noise
 from utils.domain_randomization import Randomizable
 from utils.errors import UserError
@@ -363,17 +364,19 @@ class Cell(ABC):
         return on_table(position) and margin <= _REACH * self.config.workspace.size
 
     def truth(self) -> SceneGeometry:
-        """The true geometry of the objects still in the round, and of the scene's walls."""
+        """The true geometry of the objects still in the round, and of the scene's walls; frictions
+        are those of the fingertips on each object, as the cell may have been randomised."""
         if self.scene is None:
             raise ValueError("There is no scene; build or load one first")
-        solids = []
+        solids, changes = [], {} if self.sample is None else self.sample["physics"]
+        fingers = changed_in(changes, "finger_friction", 1.0)
         for index in sorted(self.remaining):
             model, T = self.scene.placements[index].model, self.object_pose(index)
             solids.append(
                 SolidObject(
                     tuple(solid.transformed(T) for solid in model.geometry()),
                     T[:3, 3],
-                    model.friction,
+                    fingers * changed_in(changes, "object_friction", model.friction, index),
                 )
             )
         return SceneGeometry(tuple(solids), walls=tuple(wall.solid() for wall in self.scene.walls))

@@ -354,7 +354,10 @@ def label_scene(
             appearance = Appearance()
             intrinsics, T_WC = camera_intrinsics(configured), cell.camera_pose()
         appearance.paint(cell)
-        frame = appearance.render(cell, intrinsics, T_WC, rng)
+        try:
+            frame = appearance.render(cell, intrinsics, T_WC, rng)
+        except PhysicsError:  # where it came to no rest; the next one is loaded into a rebuilt cell
+            continue
         labels = dense_labels(frame, cell.gripper, workspace)
         trials = []
         if rng.random() < config.data.executed_share:

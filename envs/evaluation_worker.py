@@ -7,6 +7,8 @@ every round.
 
 from __future__ import annotations
 
+from contextlib import nullcontext
+
 from envs.cell import camera_intrinsics, require_arm
 from envs.cell_scenes import TARGET_LAYOUT, check_suited, make_scene
 from envs.closed_loop import check_watchdog
@@ -153,20 +155,20 @@ def work(config: Config, task: Task) -> TaskResult:
                 shown = picture(frame, grasp, policy, caption, outcome.reason, kind)
                 result.gallery.append(shown)
 
-        film = Film(cell) if noise == task.filmed else None
-        result.rounds.append(
-            run_round(
-                cell, scene, planner, policy=name, objects=task.objects,
-                max_failures=config.evaluate.max_failures, abstain=config.evaluate.abstain,
-                second_look=config.evaluate.second_look, scenario=task.scenario,
-                controller=controller, on_attempt=keep, approach_by=approach,
-            )
-        )  # fmt: skip
-        if film is not None:
-            ending = config.evaluate.film_format
-            file = film_name(task, policy, noise, ending)
-            # Not written here: the run's folder may be on another machine.
-            result.films.append(FilmFile(file, film.encoded(ending), caption))
+        with Film(cell) if noise == task.filmed else nullcontext() as film:
+            result.rounds.append(
+                run_round(
+                    cell, scene, planner, policy=name, objects=task.objects,
+                    max_failures=config.evaluate.max_failures, abstain=config.evaluate.abstain,
+                    second_look=config.evaluate.second_look, scenario=task.scenario,
+                    controller=controller, on_attempt=keep, approach_by=approach,
+                )
+            )  # fmt: skip
+            if film is not None:
+                ending = config.evaluate.film_format
+                file = film_name(task, policy, noise, ending)
+                # Not written here: the run's folder may be on another machine.
+                result.films.append(FilmFile(file, film.encoded(ending), caption))
     return result
 
 

@@ -260,6 +260,7 @@ def _execute(cell: Cell, grasp: Grasp, approach: Approach, firmly: bool) -> Gras
         reason = "ik"
     except GraspFailure as failure:
         reason, detail = failure.reason, failure.detail
+        cell.robot.hold()  # it may be in the middle of a motion
     except ArmStoppedError as stop:
         reason, detail = "collision" if stop.contact else "stopped", f"stopped: {stop}"
     stopped_at = None

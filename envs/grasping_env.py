@@ -222,9 +222,9 @@ class RobotGraspingEnv(gymnasium.Env):
             return self._begin(self.cell.home.copy())
         if isinstance(start, str):
             q, opening, command = self._initial_state(start)
-            self.start = {"q": q.tolist(), "opening": float(opening), "command": float(command)}
         else:
             q, opening, command = np.array(start["q"]), start["opening"], start["command"]
+        self.start = {"q": q.tolist(), "opening": float(opening), "command": float(command)}
         self.cell.robot.place(q, opening)
         return self._begin(q, command)
 

@@ -130,7 +130,9 @@ def add_object(
         name=name, pos=list(position), quat=np.roll(quaternion, 1).tolist()
     )
     body.add_freejoint(name=name)
-    body.mass, body.inertia, body.ipos = model.mass, model.inertia, [0, 0, 0]
+    # MuJoCo compares exactly, and of a thin plate one moment is the sum of the others, rounded.
+    most = (model.inertia.sum() - model.inertia) * (1 - 1e-9)
+    body.mass, body.inertia, body.ipos = model.mass, np.minimum(model.inertia, most), [0, 0, 0]
     if model.principal is not None:
         body.iquat = np.roll(model.principal, 1).tolist()
     body.explicitinertial = True

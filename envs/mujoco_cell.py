@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 import re
+from itertools import product
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -166,8 +167,11 @@ class MujocoCell(Cell):
 
     def object_pose(self, index: int) -> np.ndarray:
         start = self._places[index]
-        w, x, y, z = self.robot.data.qpos[start + 3 : start + 7]
-        return pose_matrix(self.robot.data.qpos[start : start + 3], (x, y, z, w))
+        place = self.robot.data.qpos[start : start + 7]
+        if not np.isfinite(place).all():
+            raise PhysicsError(f"object {index} has a non-finite pose: {place}")
+        w, x, y, z = place[3:]
+        return pose_matrix(place[:3], (x, y, z, w))
 
     def object_position(self, index: int) -> np.ndarray:
         start = self._places[index]
@@ -188,7 +192,19 @@ class MujocoCell(Cell):
         data.qvel[speed : speed + 6] = [*velocity, *(turn_rate * T_WO[2, :3])]
 
     def touches_table(self, index: int) -> bool:
-        return self.robot.meet(self.bodies[index], self._table)
+        body, data = self.bodies[index], self.robot.data
+        return self.robot.meet(body, self._table) or (
+            not data.body_awake[body] and self._overlap(body, self._table)
+        )
+
+    def _overlap(self, one: int, other: int) -> bool:
+        """Whether two bodies overlap: MuJoCo has no contacts of what sleeps."""
+        model, data, places = self.robot.model, self.robot.data, np.zeros(6)
+        pairs = product(*(np.flatnonzero(model.geom_bodyid == body) for body in (one, other)))
+        return any(
+            self._mujoco.mj_geomDistance(model, data, first, second, 0.01, places) <= 0
+            for first, second in pairs
+        )
 
     def _immobilise(self, index: int) -> None:
         model, body = self.robot.model, self.bodies[index]

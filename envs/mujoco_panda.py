@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Iterator
+from itertools import combinations
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -15,7 +16,6 @@ from envs.floating_hand import YIELDING_FORCE, FloatingHand
 from envs.panda_model import (
     ARM_JOINTS,
     ARM_LINKS,
-    BASE,
     CARRIAGE_BASE,
     CARRIAGE_FORCE,
     CARRIAGE_JOINTS,
@@ -85,8 +85,8 @@ def panda_spec(gripper: GripperGeometry) -> mujoco.MjSpec:
         joint.armature = _ARMATURE
         _joint_servo(mujoco, spec, name, _STIFFNESS[i], JOINT_TORQUE[i])
     _add_gripper(mujoco, spec, gripper)
-    # MuJoCo itself lets links beside each other overlap, but not where one of them cannot move.
-    for one, other in ((BASE, "panda_link1"), ("panda_link5", "panda_link7")):
+    # As in PyBullet, the arm does not meet itself: its hulls are larger than its links.
+    for one, other in combinations([link.name for link in panda_links(gripper)], 2):
         exclude = spec.add_exclude()
         exclude.bodyname1, exclude.bodyname2 = one, other
     return spec
@@ -418,14 +418,18 @@ class MujocoFloatingHand(MujocoHand, FloatingHand):
     ):
         super().__init__(dt, gripper, grip_force)
         self._compile(spec, substeps)
-        self._reference = np.zeros(3)
+        self._yields, self._reference = False, np.zeros(3)
 
     def closing_direction(self) -> np.ndarray:
         """(3,) unit vector in W along E's y axis."""
         return self.tip_pose()[:3, 1]
 
     def yield_to_fingers(self) -> None:
-        self._send(self._limit_force, YIELDING_FORCE)
+        self._send(self._yield)
+
+    def _yield(self) -> None:
+        self._limit_force(YIELDING_FORCE)
+        self._yields = True
 
     def _limit_force(self, force: float) -> None:
         self.model.actuator_forcerange[1] = [-force, force]
@@ -439,6 +443,8 @@ class MujocoFloatingHand(MujocoHand, FloatingHand):
         for _ in range(count):
             self.receive(1)
             self._move_fingers()
+            if self._yields:  # it brakes the hand, and does not pull it back
+                self._reference[1] = self.data.qpos[self._places[1]]
             self.data.ctrl[:3] = self._reference
             self._mujoco.mj_step(self.model, self.data, self.substeps)
 
@@ -456,4 +462,4 @@ class MujocoFloatingHand(MujocoHand, FloatingHand):
 
     def _follow(self, reference: np.ndarray) -> None:
         self._limit_force(CARRIAGE_FORCE)
-        self._reference = reference
+        self._yields, self._reference = False, reference

@@ -251,8 +251,9 @@ def _plugin(path: str, settings: SetSettings) -> ObjectSet:
 
 
 def _is_folder(found: object) -> bool:
-    # Unlike pathlib's, this `expanduser` leaves the home folder of a user that is not known.
-    return isinstance(found, str | Path) and Path(os.path.expanduser(found)).is_dir()
+    # Unlike pathlib's, these leave the home folder of a user that is not known, and names that are
+    # too long for a file.
+    return isinstance(found, str | Path) and os.path.isdir(os.path.expanduser(found))
 
 
 def _no_objects(path: str, found: object, where: str) -> ObjectError:

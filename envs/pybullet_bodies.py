@@ -342,11 +342,15 @@ class PybulletTable(LayoutTable):
             PybulletTable._turn.release()
             raise RuntimeError("a PybulletTable is in use already; leave its with block first")
         PybulletTable._in_use = True
-        if PybulletTable._client is None:
-            PybulletTable._client = pybullet.connect(pybullet.DIRECT)
-            atexit.register(PybulletTable._disconnect)
-        set_up_physics(self._client, self._config.sim)
-        add_table(self._client, self._walls)
+        try:
+            if PybulletTable._client is None:
+                PybulletTable._client = pybullet.connect(pybullet.DIRECT)
+                atexit.register(PybulletTable._disconnect)
+            set_up_physics(self._client, self._config.sim)
+            add_table(self._client, self._walls)
+        except BaseException:
+            self.__exit__()
+            raise
         return self
 
     def __exit__(self, *exception: object) -> None:

@@ -53,7 +53,14 @@ from utils.result_records import (
     RoundRecord,
     policy_name,
 )
-from utils.transforms import PLANAR, Grasp, RGBDFrame, grasp_to_image
+from utils.transforms import (
+    PLANAR,
+    Grasp,
+    RGBDFrame,
+    grasp_to_image,
+    inverse_pose,
+    transform_points,
+)
 
 
 class GraspFinder(Protocol):
@@ -208,6 +215,8 @@ class _Round:
             with planner_errors(self.policy):
                 return checked_grasps(
                     self.planner(frame if self.privileged else frame.without_truth()),
+                    frame,
+                    self.cell.config.camera.far,
                     planar=self.controller != OPEN_LOOP,
                 )
         finally:
@@ -311,11 +320,22 @@ def planner_errors(name: str) -> Iterator[None]:
         raise PlannerError(f"{name} raised {type(error).__name__}: {message} ({place})") from error
 
 
-def checked_grasps(grasps: object, planar: bool = False) -> Sequence[Grasp]:
-    """What a planner returned. Raises NoGraspsError for anything but a list or tuple of grasps, and
-    where they have to be `planar` and one is tilted."""
+def checked_grasps(
+    grasps: object, frame: RGBDFrame, far: float, planar: bool = False
+) -> Sequence[Grasp]:
+    """What a planner returned. Raises NoGraspsError for anything but a list or tuple of grasps, for
+    one that the frame's camera, which sees up to `far` m, cannot show, and where they have to be
+    `planar` and one is tilted."""
     if not isinstance(grasps, list | tuple) or not all(isinstance(g, Grasp) for g in grasps):
         raise NoGraspsError(f"a planner returns a list of Grasp, this one returned {grasps!r:.60}")
+    for grasp in grasps:
+        depth = float(transform_points(inverse_pose(frame.T_WC), grasp.position)[2])
+        if not 0 < depth <= far:
+            raise NoGraspsError(
+                "a planner returns grasps that its camera sees, in metres in the world frame; this "
+                f"one has {np.array2string(grasp.position, precision=3)}, which is {depth:.3g} m "
+                f"along the camera's axis (0 to {far:g} are allowed)"
+            )
     if planar and any(grasp.tilt > PLANAR for grasp in grasps):
         raise NoGraspsError(
             "a closed loop follows grasps from straight above, this planner tilted one; use "

@@ -37,15 +37,18 @@ class Simulator:
     def installed(self) -> bool:
         return importlib.util.find_spec(self.package) is not None
 
-    def load(self, path: str, name: str) -> type:
-        """The class that `path` names. Raises UserError where the package is not installed."""
+    def check_installed(self, name: str, key: str) -> None:
+        """Raise UserError where the package is not. name, key: as in the config."""
         if not self.installed:
             ways = [self.install]
-            ways += [f"use simulator={other}" for other, one in SIMULATORS.items() if one.installed]
+            ways += [f"use {key}={other}" for other, one in SIMULATORS.items() if one.installed]
             raise UserError(
-                f"simulator={name}: the package {self.package} is not installed; "
-                + ", or ".join(ways)
+                f"{key}={name}: the package {self.package} is not installed; " + ", or ".join(ways)
             )
+
+    def load(self, path: str, name: str, key: str) -> type:
+        """The class that `path` names. Raises UserError where the package is not installed."""
+        self.check_installed(name, key)
         module, _, attribute = path.partition(":")
         return getattr(importlib.import_module(module), attribute)
 
@@ -70,11 +73,11 @@ def cell_class(name: str) -> type[Cell]:
     """The class of a simulator's cells. Raises UserError for a simulator that does not exist or is
     not installed."""
     simulator = _simulator(name, "simulator")
-    return simulator.load(simulator.cell, name)
+    return simulator.load(simulator.cell, name, "simulator")
 
 
-def make_cell(config: Config, gui: bool = False) -> Cell:
-    """A cell in the configured simulator; `gui` opens a window that shows it.
+def make_cell(config: Config) -> Cell:
+    """A cell in the configured simulator.
 
     With evaluate.randomise the cell differs from scene to scene by what the section `randomization`
     says, in the same way for the same scene. Noise and bias of actions apply to learned policies
@@ -82,7 +85,7 @@ def make_cell(config: Config, gui: bool = False) -> Cell:
     simulator, and where the cell cannot be had in it.
     """
     check_simulator(config)
-    cell = cell_class(config.simulator)(config, gui=gui)
+    cell = cell_class(config.simulator)(config)
     if config.evaluate.randomise:
         try:
             randomizer = DomainRandomizer(cell, config.randomization)
@@ -106,13 +109,14 @@ def make_layout_table(
     """A table on which a scene of these objects is laid out, in the simulator `scene.simulator`."""
     name = config.scene.simulator
     simulator = _simulator(name, "scene.simulator")
-    return simulator.load(simulator.layout_table, name)(config, models, walls)
+    return simulator.load(simulator.layout_table, name, "scene.simulator")(config, models, walls)
 
 
 def check_simulator(config: Config) -> None:
     """Raise UserError for a simulator that does not exist, is not installed, or cannot be
     randomised, and for settings that the robot's form rules out."""
-    cell = cell_class(config.simulator)
+    cell, layouts = cell_class(config.simulator), config.scene.simulator
+    _simulator(layouts, "scene.simulator").check_installed(layouts, "scene.simulator")
     if config.evaluate.randomise and not cell.can_be_randomized():
         raise not_randomizable(config)
     if config.evaluate.randomise:

@@ -22,6 +22,7 @@ from typing import Any
 import gymnasium
 import imageio.v2 as imageio
 import numpy as np
+from typing_extensions import Self
 
 from envs.cell import Cell, Intrinsics
 from envs.cell_scenes import LAYOUTS, make_scene
@@ -72,7 +73,7 @@ class Studio:
 
 
 class Film:
-    """Films a cell from now on until it is stopped.
+    """Films a cell from now on until it is stopped, at the end of a `with` block at the latest.
 
     rate: pictures a second of simulated time. size: width and height, pixels.
     """
@@ -80,6 +81,7 @@ class Film:
     def __init__(self, cell: Cell, rate: float = FILM_RATE, size: tuple[int, int] = FILM_SIZE):
         self._cell, self._studio, self._rate = cell, Studio(cell, *size), rate
         self._pictures: list[np.ndarray] = []
+        self._stopped = False
         self._every = max(1, round(1 / (rate * cell.dt)))
         cell.on_step = self._on_step
 
@@ -87,12 +89,22 @@ class Film:
         if cell.steps % self._every == 0:
             self._pictures.append(self._studio.picture())
 
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        if not self._stopped:
+            self._end()
+
+    def _end(self) -> None:
+        self._stopped, self._cell.on_step = True, None
+        self._studio.close()
+
     def stop(self) -> list[np.ndarray]:
         """Stop filming; returns the pictures, (H, W, 3) uint8 each."""
-        self._cell.on_step = None
         if not self._pictures:  # the arm has not moved: at least show the scene
             self._pictures.append(self._studio.picture())
-        self._studio.close()
+        self._end()
         return self._pictures
 
     def encoded(self, ending: str) -> bytes:

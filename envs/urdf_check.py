@@ -27,10 +27,10 @@ class _Numbers(NamedTuple):
 
 
 _NUMBERS = (
-    _Numbers("link/*/geometry/box", "size", (3,), "three numbers"),
-    _Numbers("link/*/geometry/cylinder", "radius", (1,), "a number"),
-    _Numbers("link/*/geometry/cylinder", "length", (1,), "a number"),
-    _Numbers("link/*/geometry/sphere", "radius", (1,), "a number"),
+    _Numbers("link/*/geometry/box", "size", (3,), "three numbers of 0 or more", lowest=0.0),
+    _Numbers("link/*/geometry/cylinder", "radius", (1,), "a number of 0 or more", lowest=0.0),
+    _Numbers("link/*/geometry/cylinder", "length", (1,), "a number of 0 or more", lowest=0.0),
+    _Numbers("link/*/geometry/sphere", "radius", (1,), "a number over 0", lowest=1e-9),
     _Numbers("link/*/geometry/mesh", "scale", (0, 1, 3), "one number or three", needed=False),
     _Numbers("link/inertial/mass", "value", (1,), "a number of kilograms"),
     _Numbers("link/contact/lateral_friction", "value", (1,), "a number of 0 or more"),
@@ -60,7 +60,8 @@ _NUMBERS = (
 
 def check_urdf(xml: ElementTree.Element, path: Path) -> None:
     """Raise ObjectError, which names the file and the element, for a URDF with the root `xml` that
-    has no name, a joint without its links, a mesh without a file, or words instead of numbers."""
+    has no name, a joint without its links, no link or several ones from which the others hang, a
+    geometry without a shape, a mesh without a file, or numbers that cannot be."""
     if xml.tag != "robot" or xml.get("name") is None:
         raise ObjectError(f"{path} is no URDF, which is a <robot name=...>; repair or remove it")
     links = [link.get("name") for link in xml.findall("link")]
@@ -72,6 +73,17 @@ def check_urdf(xml: ElementTree.Element, path: Path) -> None:
                     f"URDF {path}: the {end} of its joint {joint.get('name')!r} is none of its "
                     f"links ({', '.join(map(str, links))}); repair it"
                 )
+    roots = set(links) - {joint.find("child").get("link") for joint in xml.findall("joint")}
+    if len(roots) != 1:
+        raise ObjectError(
+            f"URDF {path}: {len(roots)} of its links ({', '.join(map(str, links))}) are no child "
+            "of a joint, expected one, from which the others hang; repair its joints"
+        )
+    for geometry in xml.iterfind("link/*/geometry"):
+        if len(geometry) != 1:
+            raise ObjectError(
+                f"URDF {path}: a <geometry> holds {len(geometry)} shapes, expected one; repair it"
+            )
     for mesh in xml.iterfind("link/*/geometry/mesh"):
         name = mesh.get("filename", "")
         if not name or re.match(r"(?!package:|file:)\w+://", name):

@@ -12,6 +12,7 @@ from envs.execution import execute_grasp
 from envs.floating_execution import PREGRASP, attempt, clears_table, execute_floating, floating_hand
 from envs.floating_hand import meets_box
 from envs.grasping_env import RobotGraspingEnv
+from envs.mujoco_panda import MujocoFloatingHand
 from envs.object_bodies import native_object
 from envs.object_shapes import NativeShape
 from envs.objects import load_object_set
@@ -166,6 +167,24 @@ def test_the_hand_gives_way_to_what_its_fingers_cannot_push(cell, box_set):
     before = hand.q
     cell.step(60)
     np.testing.assert_allclose(hand.q, before, atol=1e-3)
+
+
+def test_a_hand_that_gives_way_is_not_pulled_back(cell):
+    """Moved by 10 mm along its closing line, it stays there."""
+    cell.load(Scene("isolated", 0, ()))
+    hand = floating_hand(cell)
+    hand.put(cube_grasp(offset=(0.0, 0.0, 0.1)).pose)
+    hand.yield_to_fingers()
+    cell.step(10)
+    if isinstance(hand, MujocoFloatingHand):
+        hand.data.qpos[hand._places[1]] += 0.010
+    else:
+        import pybullet
+
+        pybullet.resetJointState(hand.body, 1, hand.q[1] + 0.010, physicsClientId=hand.client)
+    before = hand.tip_pose()[:3, 3]
+    cell.step(round(0.5 / cell.dt))
+    assert np.linalg.norm(hand.tip_pose()[:3, 3] - before) < 1e-3
 
 
 @pytest.mark.parametrize("tilt", [0, 30, 60, 85])  # degrees, of a closing line that leans with it

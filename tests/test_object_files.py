@@ -53,6 +53,17 @@ def test_what_others_read_is_read(tmp_path):
         (shape("<cylinder radius='0' length='0.1'/>"), "bad.urdf has neither .* of any size"),
         (shape("<box size='0.05 0.05'/>"), "size of a <box> is '0.05 0.05', expected three"),
         (shape("<box/>"), "size of a <box> is None"),
+        (
+            shape("<box size='0.1 -0.1 0.1'/>"),
+            "a <box> is '0.1 -0.1 0.1', expected three .* or more",
+        ),
+        (shape("<cylinder radius='0.03' length='-0.05'/>"), "length of a <cylinder> is '-0.05'"),
+        (shape("<sphere radius='0'/>"), "radius of a <sphere> is '0', expected a number over 0"),
+        (shape(""), "a <geometry> holds 0 shapes, expected one"),
+        (
+            "<robot name='r'><link name='l'/><link name='m'/></robot>",
+            r"2 of its links \(l, m\) are no child of a joint, expected one",
+        ),
         (shape("<mesh filename='a.obj' scale='1 0 1'/>"), "scale of a <mesh> is 0"),
         ("<contact><lateral_friction/></contact>", "value of a <lateral_friction> is None"),
         ("<inertial><mass value='heavy'/></inertial>", "value of a <mass> is 'heavy', expected a"),

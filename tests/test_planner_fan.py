@@ -311,7 +311,8 @@ def test_closed_loops_refuse_planners_that_tilt(config) -> None:
     with pytest.raises(UserError, match="heuristic6d plans .* any side.*with open_loop alone"):
         check_everything(closed)
     with pytest.raises(NoGraspsError, match="straight above"):
-        checked_grasps([Grasp(np.zeros(3), 0, 0.05, 1.0, approach(30, 0))], planar=True)
+        grasps = [Grasp((0.5, 0, 0.05), 0, 0.05, 1.0, approach(30, 0))]
+        checked_grasps(grasps, boxes_frame([]), 2.0, planar=True)
 
 
 def test_a_wall_beside_one_object_is_measured_and_infeasible() -> None:

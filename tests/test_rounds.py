@@ -1,7 +1,8 @@
 """A round: when it ends, which grasps are tried, and planners that fail."""
 
 import contextlib
-from dataclasses import replace
+import json
+from dataclasses import asdict, replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -386,6 +387,18 @@ def test_a_planner_that_raises_ends_its_round_alone(cell, box_set):
     assert attempt.reason == "planner_error" and rounds[1].executed == 0
     assert "mine:plan raised RuntimeError: no idea" in attempt.detail
     assert "test_rounds.py, line" in attempt.detail
+
+
+@pytest.mark.parametrize("height", [0.85, -1000.0])
+def test_a_grasp_that_no_camera_sees_ends_its_round(cell, box_set, height):
+    """Behind the camera, which is 0.8 m over the table, or as far away as no picture shows."""
+
+    def plan(frame):
+        return [Grasp((0.5, 0.0, height), 0.0, 0.05, 1.0)]
+
+    record = run_round(cell, cube_scene(box_set), plan, policy="x", objects="b", max_failures=2)
+    assert record.ended == "planner_error" and "that its camera sees" in record.attempts[0].detail
+    json.dumps(asdict(record), allow_nan=False)
 
 
 def test_a_call_that_raises_is_timed_itself(cell, box_set, monkeypatch):

@@ -10,9 +10,10 @@ import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 
+from envs import execution
 from envs.cell import TABLE_OR_BACKGROUND, Camera, Cell
 from envs.cell_layout import Placement, Scene, square_walls
-from envs.execution import execute_grasp
+from envs.execution import GraspFailure, execute_grasp
 from envs.object_bodies import load_object
 from envs.objects import load_object_set
 from envs.robot import Robot
@@ -177,8 +178,13 @@ def test_a_simulator_that_is_not_installed_is_refused(name, monkeypatch):
     message = f"simulator={name}: the package no_such_package is not installed; .*pip install"
     with pytest.raises(UserError, match=message):
         make_cell(config)
-    with pytest.raises(UserError, match=message):
+    with pytest.raises(UserError, match=f"scene.{message}"):
         make_layout_table(config, [])
+    (other,) = SIMULATORS.keys() - {name}
+    if other in INSTALLED:
+        mixed = load_config(None, [f"simulator={other}", f"scene.simulator={name}"])
+        with pytest.raises(UserError, match=f"scene.{message}.*use scene.simulator={other}"):
+            check_simulator(mixed)
 
 
 def test_a_simulator_without_randomisation_is_refused(monkeypatch):
@@ -205,6 +211,76 @@ def test_a_body_tumbles_alike_however_it_lies_in_its_file(taught_cell, tmp_path)
         ends.append(taught_cell.object_pose(0) @ T)
     apart = Rotation.from_matrix(ends[0][:3, :3].T @ ends[1][:3, :3]).magnitude()
     assert np.degrees(apart) < 2
+
+
+def test_a_thin_plate_keeps_the_inertia_that_its_file_states(taught_cell, tmp_path):
+    """Of a lamina one moment is the sum of the two others, but for rounding after scaling."""
+    trimesh.creation.box((0.12, 0.10, 0.002)).export(tmp_path / "plate.stl")
+    mesh = "<geometry><mesh filename='plate.stl'/></geometry>"
+    (tmp_path / "plate.urdf").write_text(
+        "<robot name='plate'><link name='l'><inertial><mass value='0.18'/><inertia ixx='0.00015' "
+        "iyy='0.000216' izz='0.000366' ixy='0' ixz='0' iyz='0'/></inertial>"
+        f"<collision>{mesh}</collision></link></robot>"
+    )
+    for scale in (0.65, 0.9, 1.0):
+        model = load_object(tmp_path / "plate.urdf", scale=scale, cache_dir=tmp_path)
+        at = Placement(model, np.array([0.5, 0.0, 0.01]), np.eye(4)[3])
+        taught_cell.load(Scene("isolated", 0, (at,)))
+        stated = 1e-4 * np.array([1.5, 2.16, 3.66]) * scale**5
+        np.testing.assert_allclose(model.inertia, stated, rtol=1e-6)
+
+
+def test_what_rests_on_the_table_touches_it_however_long(taught_cell, box_set):
+    """MuJoCo lets it sleep, and has no contacts of what sleeps."""
+    places = [(0.45, -0.06, 0.03), (0.55, 0.06, 0.03), (0.55, 0.06, 0.09)]
+    cubes = tuple(Placement(box_set[0], np.array(place), np.eye(4)[3]) for place in places)
+    taught_cell.load(Scene("isolated", 0, cubes))
+    taught_cell.step(round(1.0 / taught_cell.dt))
+    assert [taught_cell.touches_table(i) for i in range(3)] == [True, True, False]
+
+
+@pytest.mark.parametrize("simulator", INSTALLED)
+def test_the_true_friction_is_that_of_the_randomised_cell(simulator, box_set):
+    ranges = [
+        f"randomization.physics.{name}=[{low}, {high}, uniform, scale, episode]"
+        for name, low, high in (("object_friction", 0.5, 0.6), ("finger_friction", 0.8, 0.9))
+    ]
+    with _cell(simulator, "evaluate.randomise=true", *ranges) as cell:
+        at = Placement(box_set[0], np.array([0.5, 0.0, 0.03]), np.eye(4)[3])
+        cell.load(Scene("isolated", 3, (at,)))
+        (friction,) = (thing.friction for thing in cell.truth().objects)
+        assert 0.4 <= friction / box_set[0].friction <= 0.54
+
+
+def test_an_arm_that_a_failure_has_stopped_goes_home_from_where_it_is(cell, monkeypatch):
+    """In the middle of a quick motion; the gate's reference is where the arm is then."""
+    rest, apart, go_home = cell.robot.q, [], execution.go_home
+
+    def lost(cell, grasp):
+        path = cell.robot.joint_move(rest, rest + 0.5)
+        half = len(path.positions) // 2
+        for q, velocity in zip(path.positions[:half], path.velocities[:half]):
+            cell.robot.command_arm(q, velocity)
+            cell.step()
+        assert np.abs(path.velocities[half]).max() > 1.0  # rad/s
+        raise GraspFailure("missed")
+
+    def go_home_later(cell):
+        cell.step(round(0.3 / cell.dt))
+        apart.append(np.abs(cell.robot.q - cell.robot.gate._q).max())
+        return go_home(cell)
+
+    monkeypatch.setattr(execution, "go_home", go_home_later)
+    outcome = execute_grasp(cell, Grasp((0.5, 0.0, 0.03), 0.0, 0.08, 1.0), lost)
+    assert outcome.reason == "missed" and outcome.detail == "" and apart[0] < 0.02
+
+
+def test_the_arm_does_not_meet_itself(cell):
+    """A posture in which the hand's hull overlaps that of a link: nothing is felt."""
+    q = np.array([0.0, -0.3, 0.0, -2.9, 0.0, 0.4, 0.8])
+    cell.robot.place(q)
+    cell.step(round(0.2 / cell.dt))
+    assert np.linalg.norm(cell.robot.external_force()) < 2 and np.abs(cell.robot.q - q).max() < 0.01
 
 
 def test_placing_the_arm_leaves_a_moving_object_moving(cell):

@@ -159,7 +159,7 @@ def test_distances_do_not_tell_depths_before_the_foot_of_the_origin():
 
 @pytest.mark.parametrize("focal", [150.0, 160.0, 544.0 / 3])
 def test_a_wide_angle_camera_s_depths_are_told_from_distances(focal):
-    """Rays beside the start of the search, which they would meet at infinity or behind the camera."""
+    """Some rays never meet the plane from which the search starts."""
     wide = np.array([[focal, 0, 320], [0, focal, 240], [0, 0, 1.0]])
     misses = table_misses(np.full((480, 640), 0.8), wide)
     assert misses[DEPTHS] < 1e-6 and misses[FROM_BASE] < 1e-3 and misses[FROM_CAMERA] > 0.02

@@ -244,9 +244,9 @@ def check_mask(mask: np.ndarray | None) -> list[str]:
 
 
 def check_view(frame: RGBDFrame, workspace: Workspace, given: bool = False) -> list[str]:
-    """Remarks on a view that shows little. given: whether it is the user who says how high the table
-    is. Raises UserError for a view from which grasps would be guessed: too oblique, or with too
-    little of the workspace in the image or measured."""
+    """Remarks on a view that shows little. given: whether the user has said how high the table is.
+    Raises UserError for a view from which grasps would be guessed: too oblique, or with too little
+    of the workspace in the image or measured."""
     tilt = float(np.rad2deg(np.arccos(np.clip(-frame.T_WC[2, 2], -1, 1))))
     if tilt > MOST_OBLIQUE:
         raise UserError(
