@@ -34,6 +34,7 @@ from benchmarks.table_cells import (
     rows_of,
     success,
     table,
+    weights_in_words,
     with_depths,
 )
 from utils.atomic_files import write_atomic
@@ -108,6 +109,7 @@ CHINESE = {
     "cleared": "清空率",
     "15 objects: success": "15 个物体：成功率",
     "measured at commit": "测量于提交",
+    "with an earlier": "，使用较早的",
     "seed": "种子",
     "95 % intervals": "95 % 区间",
     "{} rounds a row": "每行 {} 轮",
@@ -515,7 +517,8 @@ TABLES: dict[str, tuple[tuple[str, ...], Callable[..., str]]] = {
 
 def _short(say: Say, few: Figures, many: Figures) -> str:
     origins = "; ".join(
-        f"{say(objects)}: {say('measured at commit')} `{part['commit'][:10]}`, {say('seed')} "
+        f"{say(objects)}: {say('measured at commit')} `{part['commit'][:10]}`"
+        f"{weights_in_words(say, part)}, {say('seed')} "
         f"{part['seed']}{rounds_in_words(say, next(iter(part['commands'].values())))}"
         for objects, part in (("5 objects", few), ("15 objects", many))
     )

@@ -5,15 +5,20 @@ Figures are plain data, as docs/results/*.json hold them. This module knows no s
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Callable, Sequence
 from typing import Any
 
+from models.graspnet_io import SHIPPED
 from utils.result_formats import rate_in_percent, signed_points
 from utils.result_records import CLEAN
 from utils.statistics import FEW_ROUNDS, wilson_interval
 
 Figures = dict[str, Any]  # of one part, as docs/results/<part>.json holds them
 Say = Callable[[str], str]  # a word in the page's language
+CHECKPOINTS = SHIPPED.parent
+WEIGHTS = "graspnet.pt", "critic.pt", "calibration.json"  # there: what planners with a network are
+OF_WEIGHTS = "graspnet", "graspnet_direct", "graspnet6d", "oracle"  # planners that need them
 
 
 # --- Cells ------------------------------------------------------------------------------------
@@ -122,10 +127,29 @@ def origin(say: Say, *parts: Figures) -> str:
             f"`{one['command']}`{rounds_in_words(say, one)}" for one in part["commands"].values()
         )
         said.append(
-            f"<sub>{say('measured at commit')} `{part['commit'][:10]}` ({part['date']}), "
-            f"{_seed(say, part)}{commands}</sub>"
+            f"<sub>{say('measured at commit')} `{part['commit'][:10]}` ({part['date']})"
+            f"{weights_in_words(say, part)}, {_seed(say, part)}{commands}</sub>"
         )
     return "\n".join(said)
+
+
+def blob(content: bytes) -> str:
+    """The name that git gives a file with this content."""
+    return hashlib.sha1(b"blob %d\0" % len(content) + content).hexdigest()
+
+
+def weights_in_words(say: Say, part: Figures) -> str:
+    """' with an earlier critic.pt', where planners with a network or its critic were measured with
+    other files than those of now; else nothing."""
+    rows = [row for one in part["commands"].values() for row in one.get("rows", ())]
+    if not any(row.get("policy") in OF_WEIGHTS for row in rows):
+        return ""
+    changed = [
+        f"`{name}`"
+        for name, was in part.get("weights", {}).items()
+        if was != blob((CHECKPOINTS / name).read_bytes())
+    ]
+    return f" {say('with an earlier')} {', '.join(changed)}" if changed else ""
 
 
 def _seed(say: Say, part: Figures) -> str:

@@ -17,7 +17,7 @@ from benchmarks.looks import add_look, begin_look
 from benchmarks.result_parts import PARTS, SEALED, SEED, SPLIT, Part
 from benchmarks.result_tables import OVERVIEW, PAGES, TABLES, with_tables, write_tables
 from benchmarks.results import chosen_parts, main
-from benchmarks.table_cells import cleared, points, rate, success
+from benchmarks.table_cells import CHECKPOINTS, WEIGHTS, blob, cleared, points, rate, success
 from tests.helpers.records import CONFIG, ROUNDS
 from utils.config import dump_config, load_config
 from utils.errors import UserError
@@ -53,6 +53,26 @@ def figures(folder, name: str, rows: list[dict]) -> None:
     command = {"command": "python evaluate.py seed=2027", "rows": rows, "comparisons": [pair]}
     part = {"part": name, "commit": 40 * "a", "seed": 2027, "date": "2026-11-22"}
     (folder / f"{name}.json").write_text(json.dumps(part | {"commands": {name: command}}))
+
+
+def test_a_table_of_other_weights_says_so(tmp_path):
+    now = {name: blob((CHECKPOINTS / name).read_bytes()) for name in WEIGHTS}
+    for name in WEIGHTS:
+        command = ["git", "hash-object", str(CHECKPOINTS / name)]
+        hashed = subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
+        assert now[name] == hashed
+    for policy, weights, words in (
+        ("graspnet6d", now, ""),
+        ("graspnet6d", now | {"critic.pt": 40 * "0"}, " with an earlier `critic.pt`"),
+        ("oracle", dict.fromkeys(now), " with an earlier `graspnet.pt`, `critic.pt`, `cal"),
+        ("heuristic", dict.fromkeys(now), ""),
+    ):
+        figures(tmp_path, "direct", [row(policy, 450, 500)])
+        content = json.loads((tmp_path / "direct.json").read_text())
+        (tmp_path / "direct.json").write_text(json.dumps(content | {"weights": weights}))
+        written = with_tables("<!-- results:direct -->\n<!-- /results -->", tmp_path)
+        assert f"`aaaaaaaaaa` (2026-11-22){words}" in written
+        assert ("earlier" in written) is bool(words)
 
 
 def test_rate_has_wilsons_interval():
@@ -498,6 +518,7 @@ def two_parts(tmp_path, monkeypatch):
     monkeypatch.setattr(results, "run_command", run_command)
     monkeypatch.setattr(results, "code_commit", lambda: 40 * "c")
     monkeypatch.setattr(results, "_git", lambda *arguments: 40 * "c")
+    monkeypatch.setattr(results, "weights_of", lambda commit: {})
     page = tmp_path / "docs" / "results.md"
     monkeypatch.setattr(
         results, "write_tables", lambda folder: write_tables(folder, ["docs/results.md"])
