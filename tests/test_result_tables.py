@@ -421,6 +421,7 @@ def test_finished_commands_are_not_run_again(tmp_path, monkeypatch):
 
     monkeypatch.setattr(results, "run_command", run_command)
     monkeypatch.setattr(results, "code_commit", lambda: "c0ffee")
+    monkeypatch.setattr(results, "weights_of", lambda commit: {})
     (tmp_path / "docs").mkdir()
     (part,) = chosen_parts("ppo")
     with pytest.raises(KeyboardInterrupt):
