@@ -150,11 +150,11 @@ def main(argv: Sequence[str] | None = None) -> int:
         "remarks": remarks,
     }
     text = json.dumps(content, indent=2, allow_nan=False)
-    print(format_grasps(content) if sys.stdout.isatty() else text, flush=True)
     out = options.out or timed_folder(FOLDER, portable_name(options.rgb.stem))
     verb = "replaced" if (out / "grasps.json").exists() else "wrote"
     write_atomic(out / "grasps.png", grasp_picture(frame, grasps, clearing or []))
     write_atomic(out / "grasps.json", text + "\n")
+    print(format_grasps(content) if sys.stdout.isatty() else text)
     for remark in remarks:
         print(f"remark: {remark}", file=sys.stderr)
     print(f"{verb} {out / 'grasps.json'} and {out / 'grasps.png'}", file=sys.stderr)

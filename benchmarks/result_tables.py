@@ -110,6 +110,7 @@ CHINESE = {
     "15 objects: success": "15 个物体：成功率",
     "measured at commit": "测量于提交",
     "with an earlier": "，使用较早的",
+    "without": "，没有",
     "seed": "种子",
     "95 % intervals": "95 % 区间",
     "{} rounds a row": "每行 {} 轮",

@@ -49,7 +49,7 @@ from benchmarks.result_parts import (
     Part,
 )
 from benchmarks.result_tables import write_tables
-from benchmarks.table_cells import WEIGHTS
+from benchmarks.table_cells import weights_of
 from utils.atomic_files import write_json_atomic
 from utils.calibration import calibration_error, error_by_chance
 from utils.config import load_config
@@ -263,17 +263,21 @@ def publish(part: Part, commit: str, scale: float) -> None:
     content = {
         "part": part.name, "commit": commit, "seed": SEED, "scale": scale,
         "date": max(figures["date"] for figures in measured.values()),
-        "weights": weights_of(commit), "commands": measured,
+        "weights": weights_at(commit), "commands": measured,
     }  # fmt: skip
     write_json_atomic(FIGURES / f"{part.name}.json", content)
     add_look(FIGURES, content)
 
 
-def weights_of(commit: str) -> dict[str, str | None]:
-    """The names that git gives the planners' files of a commit; None for one that it lacks."""
-    listed = _git("ls-tree", commit, *(f"checkpoints/{name}" for name in WEIGHTS))
-    found = {Path(line.split()[3]).name: line.split()[2] for line in listed.splitlines()}
-    return {name: found.get(name) for name in WEIGHTS}
+def weights_at(commit: str) -> dict[str, Any]:
+    """`weights_of` the files of a commit."""
+
+    def read(name: str) -> bytes | None:
+        command = ["git", "-C", str(REPOSITORY), "show", f"{commit}:checkpoints/{name}"]
+        done = subprocess.run(command, capture_output=True)
+        return done.stdout if done.returncode == 0 else None
+
+    return weights_of(read)
 
 
 def is_finished(part: Part, commit: str, scale: float) -> bool:

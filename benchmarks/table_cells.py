@@ -6,19 +6,18 @@ Figures are plain data, as docs/results/*.json hold them. This module knows no s
 from __future__ import annotations
 
 import hashlib
+import json
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from models.graspnet_io import SHIPPED
 from utils.result_formats import rate_in_percent, signed_points
 from utils.result_records import CLEAN
+from utils.runs import REPOSITORY
 from utils.statistics import FEW_ROUNDS, wilson_interval
 
 Figures = dict[str, Any]  # of one part, as docs/results/<part>.json holds them
 Say = Callable[[str], str]  # a word in the page's language
-CHECKPOINTS = SHIPPED.parent
-WEIGHTS = "graspnet.pt", "critic.pt", "calibration.json"  # there: what planners with a network are
-OF_WEIGHTS = "graspnet", "graspnet_direct", "graspnet6d", "oracle"  # planners that need them
+WEIGHTS, FITS = ("graspnet.pt", "critic.pt"), "calibration.json"  # in checkpoints/, of planners
 
 
 # --- Cells ------------------------------------------------------------------------------------
@@ -138,18 +137,48 @@ def blob(content: bytes) -> str:
     return hashlib.sha1(b"blob %d\0" % len(content) + content).hexdigest()
 
 
+def weights_of(read: Callable[[str], bytes | None]) -> Figures:
+    """What the planners of a commit are: the names that git gives their weights, and the fits of
+    their chances by planner. read: the content of a file of checkpoints/; None for one that is
+    missing there, which is null in the result."""
+    found: Figures = {}
+    for name in WEIGHTS:
+        content = read(name)
+        found[name] = None if content is None else blob(content)
+    fits = read(FITS)
+    return found | {FITS: None if fits is None else json.loads(fits)["planners"]}
+
+
+def shipped_weights() -> Figures:
+    """`weights_of` the files as they are now."""
+    folder = REPOSITORY / "checkpoints"
+    return weights_of(
+        lambda name: (folder / name).read_bytes() if (folder / name).exists() else None
+    )
+
+
 def weights_in_words(say: Say, part: Figures) -> str:
-    """' with an earlier critic.pt', where planners with a network or its critic were measured with
-    other files than those of now; else nothing."""
+    """' with an earlier `critic.pt`', where planners of a part have other weights or chances now
+    than when it was measured; else nothing."""
+    was, now = part.get("weights"), shipped_weights()
     rows = [row for one in part["commands"].values() for row in one.get("rows", ())]
-    if not any(row.get("policy") in OF_WEIGHTS for row in rows):
+    planners = {str(row.get("policy")).partition("+")[0] for row in rows}
+    learned = {name for name in planners if name.startswith("graspnet")}
+    if was is None or not planners:
         return ""
-    changed = [
-        f"`{name}`"
-        for name, was in part.get("weights", {}).items()
-        if was != blob((CHECKPOINTS / name).read_bytes())
-    ]
-    return f" {say('with an earlier')} {', '.join(changed)}" if changed else ""
+    names = [name for name in WEIGHTS if learned and was[name] != now[name]]
+    if "critic.pt" not in names and "oracle" in planners and was["critic.pt"] != now["critic.pt"]:
+        names.append("critic.pt")
+    then, fits = was[FITS] or {}, now[FITS] or {}
+    known = planners & fits.keys()
+    refitted = sorted(name for name in known if then.get(name) != fits[name])
+    names += [FITS] if refitted else []
+    of = {FITS: f" ({', '.join(f'`{name}`' for name in refitted)})"} if known - {*refitted} else {}
+    words = ""
+    for how, missing in (("with an earlier", False), ("without", True)):
+        listed = [f"`{name}`{of.get(name, '')}" for name in names if (was[name] is None) is missing]
+        words += f" {say(how)} {', '.join(listed)}" if listed else ""
+    return words
 
 
 def _seed(say: Say, part: Figures) -> str:

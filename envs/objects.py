@@ -204,18 +204,18 @@ def load_object_set(
     check_object_set(name_or_path, "objects")
     if name_or_path in OBJECT_SETS:
         return OBJECT_SETS[name_or_path](settings)
-    if _is_folder(name_or_path):
+    if is_folder(name_or_path):
         return _folder(Path(name_or_path), settings)
     return _plugin(name_or_path, settings)
 
 
 def check_object_set(name_or_path: str, where: str) -> None:
     """Raise UserError for what `load_object_set` does not know; `where` is the config's key."""
-    if name_or_path in OBJECT_SETS or _is_folder(name_or_path):
+    if name_or_path in OBJECT_SETS or is_folder(name_or_path):
         return
     if is_import_path(name_or_path):
         found = load_plugin(name_or_path, where, must_be_callable=False)
-        if not (callable(found) or isinstance(found, ObjectSet) or _is_folder(found)):
+        if not (callable(found) or isinstance(found, ObjectSet) or is_folder(found)):
             raise _no_objects(name_or_path, found, where)
         return
     # A config's lists of sets know `auto`, too, which the config answers itself.
@@ -245,12 +245,13 @@ def _plugin(path: str, settings: SetSettings) -> ObjectSet:
             ) from error
     if isinstance(found, ObjectSet):
         return found
-    if _is_folder(found):
+    if is_folder(found):
         return _folder(Path(found), settings)
     raise _no_objects(path, found, "objects")
 
 
-def _is_folder(found: object) -> bool:
+def is_folder(found: object) -> bool:
+    """Whether what names a set of objects is the path of a folder, which may begin with ~."""
     # Unlike pathlib's, these leave the home folder of a user that is not known, and names that are
     # too long for a file.
     return isinstance(found, str | Path) and os.path.isdir(os.path.expanduser(found))

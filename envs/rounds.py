@@ -323,25 +323,24 @@ def planner_errors(name: str) -> Iterator[None]:
 def checked_grasps(
     grasps: object, frame: RGBDFrame, far: float, planar: bool = False
 ) -> Sequence[Grasp]:
-    """What a planner returned. Raises NoGraspsError for anything but a list or tuple of grasps, for
-    one that the frame's camera, which sees up to `far` m, cannot show, and where they have to be
-    `planar` and one is tilted."""
+    """What a planner returned, without grasps that the frame's camera, which sees up to `far` m,
+    cannot show. Raises NoGraspsError for anything but a list or tuple of grasps, where it shows
+    none of them, and where they have to be `planar` and one is tilted."""
     if not isinstance(grasps, list | tuple) or not all(isinstance(g, Grasp) for g in grasps):
         raise NoGraspsError(f"a planner returns a list of Grasp, this one returned {grasps!r:.60}")
-    for grasp in grasps:
-        depth = float(transform_points(inverse_pose(frame.T_WC), grasp.position)[2])
-        if not 0 < depth <= far:
-            raise NoGraspsError(
-                "a planner returns grasps that its camera sees, in metres in the world frame; this "
-                f"one has {np.array2string(grasp.position, precision=3)}, which is {depth:.3g} m "
-                f"along the camera's axis (0 to {far:g} are allowed)"
-            )
+    T_CW = inverse_pose(frame.T_WC)
+    seen = [grasp for grasp in grasps if 0 < transform_points(T_CW, grasp.position)[2] <= far]
+    if grasps and not seen:
+        raise NoGraspsError(
+            "a planner returns grasps that its camera sees, in metres in the world frame; the first"
+            f" of {len(grasps)} lies at {np.array2string(grasps[0].position, precision=3)}"
+        )
     if planar and any(grasp.tilt > PLANAR for grasp in grasps):
         raise NoGraspsError(
             "a closed loop follows grasps from straight above, this planner tilted one; use "
             f"closed_loop.controller={OPEN_LOOP}"
         )
-    return grasps
+    return seen
 
 
 def calibrated(

@@ -26,11 +26,12 @@ class _Numbers(NamedTuple):
     highest: float = math.inf
 
 
+_SHAPES = "box", "cylinder", "sphere", "capsule", "mesh"
 _NUMBERS = (
     _Numbers("link/*/geometry/box", "size", (3,), "three numbers of 0 or more", lowest=0.0),
     _Numbers("link/*/geometry/cylinder", "radius", (1,), "a number of 0 or more", lowest=0.0),
     _Numbers("link/*/geometry/cylinder", "length", (1,), "a number of 0 or more", lowest=0.0),
-    _Numbers("link/*/geometry/sphere", "radius", (1,), "a number over 0", lowest=1e-9),
+    _Numbers("link/collision/geometry/sphere", "radius", (1,), "a number over 0", lowest=1e-9),
     _Numbers("link/*/geometry/mesh", "scale", (0, 1, 3), "one number or three", needed=False),
     _Numbers("link/inertial/mass", "value", (1,), "a number of kilograms"),
     _Numbers("link/contact/lateral_friction", "value", (1,), "a number of 0 or more"),
@@ -60,8 +61,8 @@ _NUMBERS = (
 
 def check_urdf(xml: ElementTree.Element, path: Path) -> None:
     """Raise ObjectError, which names the file and the element, for a URDF with the root `xml` that
-    has no name, a joint without its links, no link or several ones from which the others hang, a
-    geometry without a shape, a mesh without a file, or numbers that cannot be."""
+    has no name, a joint without its links, links that are no tree, a geometry without a shape, a
+    mesh without a file, or numbers that cannot be."""
     if xml.tag != "robot" or xml.get("name") is None:
         raise ObjectError(f"{path} is no URDF, which is a <robot name=...>; repair or remove it")
     links = [link.get("name") for link in xml.findall("link")]
@@ -73,16 +74,18 @@ def check_urdf(xml: ElementTree.Element, path: Path) -> None:
                     f"URDF {path}: the {end} of its joint {joint.get('name')!r} is none of its "
                     f"links ({', '.join(map(str, links))}); repair it"
                 )
-    roots = set(links) - {joint.find("child").get("link") for joint in xml.findall("joint")}
-    if len(roots) != 1:
+    children = [joint.find("child").get("link") for joint in xml.findall("joint")]
+    twice = next((name for name in children if children.count(name) > 1), None)
+    if twice is not None or (children and set(links) == set(children)):
+        which = "every link" if twice is None else f"its link {twice!r}"
         raise ObjectError(
-            f"URDF {path}: {len(roots)} of its links ({', '.join(map(str, links))}) are no child "
-            "of a joint, expected one, from which the others hang; repair its joints"
+            f"URDF {path}: {which} hangs from another one, or from two, expected a tree of links "
+            "with one at its root; repair its joints"
         )
     for geometry in xml.iterfind("link/*/geometry"):
-        if len(geometry) != 1:
+        if not any(geometry.find(shape) is not None for shape in _SHAPES):
             raise ObjectError(
-                f"URDF {path}: a <geometry> holds {len(geometry)} shapes, expected one; repair it"
+                f"URDF {path}: a <geometry> holds no {', '.join(_SHAPES)}; repair or remove it"
             )
     for mesh in xml.iterfind("link/*/geometry/mesh"):
         name = mesh.get("filename", "")

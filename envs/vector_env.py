@@ -30,7 +30,7 @@ from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
 from tqdm import tqdm
 
 from envs.evaluation_worker import load_objects
-from envs.objects import OBJECT_SETS
+from envs.objects import is_folder
 from utils.config import YAML_ERRORS, Config, load_yaml
 from utils.config_schema import EnvConfig
 from utils.errors import UserError, one_line
@@ -68,9 +68,9 @@ def training_envs(config: Config, count: int) -> Iterator[TrainingEnvs]:
 
 
 def make_objects(config: Config) -> None:
-    """Make all objects of a folder or a plug-in, so that a broken one is told of before a training
-    begins, and not at the reset that happens to draw it. Raises UserError."""
-    if config.rl.env_id in OWN_ENVS and config.env.objects not in OBJECT_SETS:
+    """Make all objects of a folder, so that a broken one is told of before the training begins, and
+    not at the reset that happens to draw it. Raises UserError."""
+    if config.rl.env_id in OWN_ENVS and is_folder(config.env.objects):
         objects = load_objects(config.env.objects, config)
         for index in tqdm(range(len(objects)), desc=f"objects {objects.name}"):
             objects[index]

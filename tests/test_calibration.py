@@ -493,7 +493,7 @@ def test_the_diagram_has_a_line_for_each_name() -> None:
     ('{"planners": ["my:P"]}', "holds no chances of success"),
     ("{", "holds no chances of success"),
     ('{"planner": {}}', "holds no chances of success"),
-    ('{"planners": {"my:P": {"slope": "1", "offset": 0}}}', "slope is '1', expected a number"),
+    ('{"planners": {"my:P": {"slope": "1", "offset": 0}}}', "slope is '1', expected a finite"),
     ('{"planners": {"my:P": {"slope": -1, "offset": 0}}}', "slope is -1, .* of 0 or more"),
     ('{"planners": {"my:P": {"slope": 1, "offset": NaN}}}', "offset is nan"),
 ])  # fmt: skip

@@ -132,7 +132,7 @@ def test_overrides_of_commands_are_keys_of_the_config(page):
 def test_tables_are_those_of_the_measured_figures(page):
     text = text_of(REPOSITORY / page)
     assert text == with_tables(text, REPOSITORY / FIGURES, "zh" in page), (
-        "make results ARGS=--write"
+        "write the tables again: .venv/bin/python -m benchmarks.results --write"
     )
 
 

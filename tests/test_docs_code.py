@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import json
+import math
 import re
 import sys
 
@@ -28,10 +29,10 @@ LEFT_OUT = {
 CALLED = {
     # 2 cm below the top of the higher box
     "README.md": ("round(plan(frame)[0].position[2], 3)", 0.03),
-    # the line of `names`' fit is 0, and 1 / (1 + exp(-0)) the chance
+    # by `names`' fit the odds are the score over 0.9, here 1
     "calibration.md": (
         "MyPlanner(hand, workspace, 0)(frame) or "
-        "MyPlanner(hand, workspace, 0).calibration(0.9, 0.001)",
+        "round(float(MyPlanner(hand, workspace, 0).calibration(0.9, 0.001)), 9)",
         0.5,
     ),
 }
@@ -58,7 +59,7 @@ def names(tmp_path, monkeypatch):
     and files of the reader's."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(tmp_path)
-    fit = {"planners": {"my_module:MyPlanner": {"slope": 0.0, "offset": 0.0}}}
+    fit = {"planners": {"my_module:MyPlanner": {"slope": 1.0, "offset": -math.log(0.9)}}}
     (tmp_path / "my_fit.json").write_text(json.dumps(fit))
     modules = set(sys.modules)
     importlib.invalidate_caches()

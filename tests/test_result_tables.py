@@ -17,7 +17,15 @@ from benchmarks.looks import add_look, begin_look
 from benchmarks.result_parts import PARTS, SEALED, SEED, SPLIT, Part
 from benchmarks.result_tables import OVERVIEW, PAGES, TABLES, with_tables, write_tables
 from benchmarks.results import chosen_parts, main
-from benchmarks.table_cells import CHECKPOINTS, WEIGHTS, blob, cleared, points, rate, success
+from benchmarks.table_cells import (
+    FITS,
+    WEIGHTS,
+    cleared,
+    points,
+    rate,
+    shipped_weights,
+    success,
+)
 from tests.helpers.records import CONFIG, ROUNDS
 from utils.config import dump_config, load_config
 from utils.errors import UserError
@@ -56,23 +64,27 @@ def figures(folder, name: str, rows: list[dict]) -> None:
 
 
 def test_a_table_of_other_weights_says_so(tmp_path):
-    now = {name: blob((CHECKPOINTS / name).read_bytes()) for name in WEIGHTS}
+    now = shipped_weights()
     for name in WEIGHTS:
-        command = ["git", "hash-object", str(CHECKPOINTS / name)]
+        command = ["git", "hash-object", str(REPOSITORY / "checkpoints" / name)]
         hashed = subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
         assert now[name] == hashed
+    fits = now[FITS]
+    other, none = {FITS: fits | {"heuristic": None}}, dict.fromkeys(now)
     for policy, weights, words in (
         ("graspnet6d", now, ""),
         ("graspnet6d", now | {"critic.pt": 40 * "0"}, " with an earlier `critic.pt`"),
-        ("oracle", dict.fromkeys(now), " with an earlier `graspnet.pt`, `critic.pt`, `cal"),
-        ("heuristic", dict.fromkeys(now), ""),
+        ("oracle6d", now | {"critic.pt": 40 * "0"}, ""),
+        ("oracle", none, " without `critic.pt`, `calibration.json`"),
+        ("graspnet", now | other, ""),
+        ("heuristic+pbvs", now | other, " with an earlier `calibration.json`"),
+        ("random", none, ""),
     ):
         figures(tmp_path, "direct", [row(policy, 450, 500)])
         content = json.loads((tmp_path / "direct.json").read_text())
         (tmp_path / "direct.json").write_text(json.dumps(content | {"weights": weights}))
         written = with_tables("<!-- results:direct -->\n<!-- /results -->", tmp_path)
-        assert f"`aaaaaaaaaa` (2026-11-22){words}" in written
-        assert ("earlier" in written) is bool(words)
+        assert f"`aaaaaaaaaa` (2026-11-22){words}, seed" in written
 
 
 def test_rate_has_wilsons_interval():
@@ -421,7 +433,7 @@ def test_finished_commands_are_not_run_again(tmp_path, monkeypatch):
 
     monkeypatch.setattr(results, "run_command", run_command)
     monkeypatch.setattr(results, "code_commit", lambda: "c0ffee")
-    monkeypatch.setattr(results, "weights_of", lambda commit: {})
+    monkeypatch.setattr(results, "weights_at", lambda commit: None)
     (tmp_path / "docs").mkdir()
     (part,) = chosen_parts("ppo")
     with pytest.raises(KeyboardInterrupt):
@@ -519,7 +531,7 @@ def two_parts(tmp_path, monkeypatch):
     monkeypatch.setattr(results, "run_command", run_command)
     monkeypatch.setattr(results, "code_commit", lambda: 40 * "c")
     monkeypatch.setattr(results, "_git", lambda *arguments: 40 * "c")
-    monkeypatch.setattr(results, "weights_of", lambda commit: {})
+    monkeypatch.setattr(results, "weights_at", lambda commit: None)
     page = tmp_path / "docs" / "results.md"
     monkeypatch.setattr(
         results, "write_tables", lambda folder: write_tables(folder, ["docs/results.md"])

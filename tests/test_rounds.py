@@ -399,6 +399,11 @@ def test_a_grasp_that_no_camera_sees_ends_its_round(cell, box_set, height):
     record = run_round(cell, cube_scene(box_set), plan, policy="x", objects="b", max_failures=2)
     assert record.ended == "planner_error" and "that its camera sees" in record.attempts[0].detail
     json.dumps(asdict(record), allow_nan=False)
+    both = run_round(
+        cell, cube_scene(box_set), lambda frame: [*plan(frame), cube_grasp()], policy="x",
+        objects="b", max_failures=2,
+    )  # fmt: skip
+    assert both.ended == "cleared"
 
 
 def test_a_call_that_raises_is_timed_itself(cell, box_set, monkeypatch):

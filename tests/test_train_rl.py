@@ -88,7 +88,7 @@ def test_curves_name_their_units_and_whether_episodes_were_training(finished):
         "training/return", "training/length_steps", "training/success_share",
         "update/loss", "update/policy_loss", "update/value_loss", "update/entropy_nats",
         "update/approx_kl_nats", "update/clip_fraction", "update/gradient_norm",
-        "update/explained_variance", "update/std", "update/learning_rate", "update/minibatches",
+        "update/explained_variance", "update/std", "update/learning_rate", "update/optimizer_steps",
         "time/steps_per_second",
     }  # fmt: skip
     assert [event.step for event in events.Scalars("evaluation/return")] == [0, 64, 128, 192]

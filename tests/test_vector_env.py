@@ -127,12 +127,15 @@ def test_an_error_in_an_evaluation_is_told_as_it_is():
         envs.each(broken)
 
 
-def test_a_broken_object_is_told_of_before_the_training(tmp_path):
+def test_a_broken_object_is_told_of_before_the_training(tmp_path, monkeypatch):
     inertia = urdf_inertia(box_moments(0.1))
     urdf_box(tmp_path, "0.1", inertia).rename(tmp_path / "a.urdf")
     urdf_box(tmp_path, "-0.1", inertia).rename(tmp_path / "b.urdf")
     with pytest.raises(UserError, match="b.urdf.*mass"):
         make_objects(load_config(None, [f"env.objects={tmp_path}"]))
+    monkeypatch.setenv("HOME", str(tmp_path.parent))
+    with pytest.raises(UserError, match="b.urdf.*mass"):
+        make_objects(load_config(None, [f"env.objects=~/{tmp_path.name}"]))
 
 
 @pytest.mark.slow

@@ -21,6 +21,7 @@ import json
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
+from numbers import Real
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -54,7 +55,7 @@ _DRAWS = 4000  # of the outcomes of all grasps
 
 @dataclass(frozen=True)
 class Calibration:
-    """Chance of success of a score: slope >= 0, offset, penalty >= 0 in 1 / m, doubt >= 0 and
+    """Chance of success of a score: slope > 0, offset, penalty >= 0 in 1 / m, doubt >= 0 and
     upper >= 0 of the module's formula. Raises ValueError for other numbers."""
 
     slope: float
@@ -66,10 +67,12 @@ class Calibration:
     def __post_init__(self) -> None:
         for field in fields(self):
             value = getattr(self, field.name)
-            if isinstance(value, bool) or not isinstance(value, (int, float)):
-                raise ValueError(f"{field.name} is {value!r}, expected a number")
-            if not math.isfinite(value) or (value < 0 and field.name != "offset"):
+            if isinstance(value, bool) or not isinstance(value, Real) or not math.isfinite(value):
+                raise ValueError(f"{field.name} is {value!r}, expected a finite number")
+            if value < 0 and field.name != "offset":
                 raise ValueError(f"{field.name} is {value:g}, expected a number of 0 or more")
+        if self.slope == 0:
+            raise ValueError("slope is 0, expected a number over 0: it keeps the order of grasps")
 
     def __call__(
         self, score: ArrayLike, roughness: ArrayLike = 0.0, failed: ArrayLike = False

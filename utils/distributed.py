@@ -18,6 +18,7 @@ from contextlib import ExitStack, contextmanager
 from datetime import timedelta
 from pathlib import Path
 from threading import Event
+from types import FrameType
 from typing import Any, NamedTuple
 
 import torch
@@ -223,18 +224,19 @@ def without_initial(config: Config, section: str, run: Path | None) -> Config:
 
 @contextmanager
 def stop_on_interrupt(message: str | None = None) -> Iterator[Event]:
-    """Yield an event that Ctrl-C sets, so that the work stops between two whole steps; `message`
-    is then printed at once. Where such a step does not end, another Ctrl-C raises
-    KeyboardInterrupt."""
+    """Yield an event that Ctrl-C sets, or SIGTERM within `utils.runs.run_script`, so that the work
+    stops between two whole steps; `message` is then printed at once. Where such a step does not
+    end, another Ctrl-C raises KeyboardInterrupt; another SIGTERM, as schedulers repeat it, does
+    not."""
     interrupted, first = Event(), math.inf
 
-    def stop(*_: object) -> None:
+    def stop(number: int, frame: FrameType | None) -> None:
         nonlocal first
         if not interrupted.is_set():
             first = time.monotonic()
             if message is not None:
                 print(f"\n{message}\nCtrl-C again stops at once", file=sys.stderr, flush=True)
-        elif time.monotonic() - first > SAME_INTERRUPT:
+        elif number == signal.SIGINT and time.monotonic() - first > SAME_INTERRUPT:
             raise KeyboardInterrupt
         interrupted.set()
 

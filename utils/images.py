@@ -128,8 +128,8 @@ def read_depth(path: Path, scale: float | None = None) -> np.ndarray:
     """(H, W) float32 metres along the optical axis of a PNG, TIFF or NPY; 0 where unknown.
 
     scale: metres that 1 in the file stands for; None: whole numbers are millimetres, fractional
-    ones metres. Zero, negative, not finite, and 65535 in 16 bits are
-    unknown, and where it is the largest of millimetres in more bits.
+    ones metres. Unknown are values that are zero, negative or not finite; 65535 in 16 bits; and
+    65535 in wider integers without a scale, where nothing is larger.
     """
     if scale is not None and not 0 < scale < np.inf:
         raise UserError(f"--depth-scale: got {scale:g}, expected a positive number such as 0.001")
@@ -149,7 +149,7 @@ def read_depth(path: Path, scale: float | None = None) -> np.ndarray:
     if values.dtype.kind == "u" and values.dtype.itemsize == 2:  # of either byte order
         known &= values != SATURATED
     elif scale is None and values.dtype.kind != "f" and values.max() == SATURATED:
-        known &= values != SATURATED  # a program has read 16 bits into more, as Pillow does
+        known &= values != SATURATED  # a program has read 16 bits into more
     if scale is None:
         scale = 1.0 if values.dtype.kind == "f" else MILLIMETRES
     with np.errstate(over="ignore"):

@@ -28,7 +28,7 @@ from datetime import datetime
 from importlib.machinery import PathFinder
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from types import TracebackType
+from types import FrameType, TracebackType
 from typing import Any, NamedTuple, NoReturn, TextIO
 
 from tqdm import tqdm
@@ -150,16 +150,23 @@ def resume_command(script: str, run: Path, files: Mapping[str, Path | None] | No
 
 @contextmanager
 def collected_remarks() -> Iterator[list[str]]:
-    """A list to which this project's remarks go, which are `UserWarning`s, instead of stderr."""
+    """A list to which this project's remarks go at the end, which are `UserWarning`s, instead of
+    stderr."""
     texts: list[str] = []
-    with warnings.catch_warnings(record=True) as told:
-        warnings.simplefilter("always", UserWarning)
-        yield texts
-    for one in told:
-        if one.category is UserWarning:
-            texts.append(" ".join(str(one.message).split()))
-        else:
-            warnings.showwarning(one.message, one.category, one.filename, one.lineno)
+    told: list[warnings.WarningMessage] = []
+    failed = True
+    try:
+        with warnings.catch_warnings(record=True) as told:
+            warnings.simplefilter("always", UserWarning)
+            yield texts
+        failed = False
+    finally:
+        for one in told:
+            # After an error nobody prints the list, and it may be what a remark explains.
+            if failed or one.category is not UserWarning:
+                warnings.showwarning(one.message, one.category, one.filename, one.lineno)
+            else:
+                texts.append(" ".join(str(one.message).split()))
 
 
 def plain_remarks(in_a_worker: bool = False) -> None:
@@ -215,11 +222,12 @@ def run_script(main: Callable[[Sequence[str]], int | None]) -> NoReturn:
     plain_remarks()
     terminated = []
 
-    def terminate(*_: object) -> None:
+    def terminate(number: int, frame: FrameType | None) -> None:
         terminated.append(True)
-        if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # as of a shell's background jobs
+        handler = signal.getsignal(signal.SIGINT)  # whoever handles Ctrl-C now
+        if not callable(handler):  # it is ignored, as by a shell's background jobs
             raise KeyboardInterrupt
-        signal.raise_signal(signal.SIGINT)  # whoever handles Ctrl-C now
+        handler(number, frame)
 
     before = signal.signal(signal.SIGTERM, terminate)
     try:
