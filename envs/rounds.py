@@ -231,7 +231,7 @@ class _Round:
     def attempt(self, frame: RGBDFrame, grasp: Grasp) -> tuple[Grasp, GraspOutcome]:
         """Execute a grasp and record it; returns the one at which the hand closed."""
         cell, approach = self.cell, self.approach(frame)
-        aim = nearest_object(cell, grasp) if self.too_large else None
+        aim = nearest_object(cell, grasp)
         with disturbed(cell, self.conditions.motion(cell, len(self.attempts))):
             outcome = (
                 execute_grasp(cell, grasp, approach, firmly=self.failures.slipped)
@@ -255,11 +255,10 @@ class _Round:
         )
 
     def executed(
-        self, frame: RGBDFrame, grasp: Grasp, aim: int | None, approach: Approach,
-        outcome: GraspOutcome,
-    ) -> AttemptRecord:  # fmt: skip
+        self, frame: RGBDFrame, grasp: Grasp, aim: int, approach: Approach, outcome: GraspOutcome
+    ) -> AttemptRecord:
         """The record of an executed grasp. aim: the number of the object nearest to the planned
-        one; None where all objects fit the hand."""
+        one."""
         held, table_height = outcome.object_index, Workspace().table_height
         return AttemptRecord(
             outcome.success,
@@ -272,6 +271,7 @@ class _Round:
             graspable=(aim if held is None else held) not in self.too_large,
             tilt=grasp.tilt,
             roughness=0.0 if self.privileged else table_roughness(frame, table_height),
+            aimed=self.scene.placements[aim].model.name,
             **_in_hand(outcome),
             **_turn_ms(approach),
         )

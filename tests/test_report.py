@@ -161,6 +161,14 @@ def test_what_stopped_the_arm_is_on_the_page(tmp_path):
     assert "Why attempts failed" not in without and "turn ms" not in without
 
 
+def test_objects_that_fail_most_are_on_the_page(tmp_path):
+    failed = [replace(attempt("missed"), aimed="mug"), replace(attempt("success"), aimed="mug")]
+    page = report(tmp_path, [*ROUNDS, a_round("heuristic", 5, 5, 1, failed)])
+    assert "Objects at which most attempts failed" in page
+    assert '<td>mug</td><td class="n">1 of 2</td><td class="n">–</td>' in page
+    assert "Objects at which" not in report(tmp_path, ROUNDS)
+
+
 def test_half_of_the_pictures_are_failures_of_each_policy_in_turn():
     image = np.zeros((2, 2, 3), np.uint8)
 

@@ -10,7 +10,7 @@ from utils.config import dump_config, load_config
 from utils.errors import UserError
 from utils.result_formats import firm_in_words
 from utils.result_records import RoundRecord, append_round, policy_name
-from utils.results import compare, compare_runs, stop_reasons, summarise
+from utils.results import compare, compare_runs, hardest_objects, stop_reasons, summarise
 from utils.statistics import paired_difference_interval
 
 
@@ -152,6 +152,23 @@ def test_rounds_whose_last_objects_fell_off_are_told():
     fell = [a_round("heuristic", seed, 2, 1, [attempt("success")], "fell_off") for seed in (3, 4)]
     (stop,) = stop_reasons(fell)
     assert (stop.count, stop.reason, stop.seed) == (2, None, 3) and "fell off" in stop.sentence
+
+
+def test_an_attempt_belongs_to_what_was_held_or_else_to_what_it_aimed_at():
+    """Of three attempts at the mug one failed with the bowl in the hand; older files tell nothing."""
+    at_mug = replace(attempt("success"), aimed="mug")
+    missed = replace(attempt("missed"), aimed="mug")
+    other = replace(attempt("slipped"), aimed="mug", held="bowl")
+    rounds = [
+        a_round("heuristic", 0, 5, 1, [at_mug, missed, other]),
+        a_round("graspnet", 0, 5, 1, [missed, missed, replace(at_mug, aimed="box"), at_mug]),
+        a_round("random", 0, 5, 0, [attempt("missed"), attempt("no_plan")], "no_plan"),
+    ]
+    mug, bowl = hardest_objects(rounds, 10)
+    assert (mug.objects, mug.name, mug.failures) == ("box", "mug", 3)
+    assert mug.outcomes == {"heuristic": (1, 2), "graspnet": (2, 3)}
+    assert (bowl.name, bowl.outcomes) == ("bowl", {"heuristic": (1, 1)})
+    assert hardest_objects(rounds, 1) == [mug] and hardest_objects(ROUNDS, 10) == []
 
 
 # --- Two runs -----------------------------------------------------------------------------------

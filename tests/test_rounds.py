@@ -248,6 +248,8 @@ def test_attempts_at_what_does_not_fit_the_hand_are_counted_apart(cell, config, 
     record = run_round(cell, scene, plan, policy="x", objects="box", max_failures=2)
     assert [attempt.success for attempt in record.attempts] == [False, True, False, False]
     assert [attempt.graspable for attempt in record.attempts] == [False, True, False, False]
+    names = [scene.placements[index].model.name for index in (1, 0, 1, 1)]
+    assert [attempt.aimed for attempt in record.attempts] == names
     assert (record.objects_total, record.ungraspable) == (2, 1)
     (row,) = summarise([record], 0)
     assert (row.attempts, row.successes, row.objects_total) == (4, 1, 2)

@@ -33,11 +33,19 @@ from utils.result_formats import (
     rate_in_percent,
 )
 from utils.result_records import FAILURES, SUCCESS, RoundRecord, policy_name
-from utils.results import SEVERAL, Comparison, Row, stated_chances, stop_reasons
+from utils.results import (
+    SEVERAL,
+    Comparison,
+    Row,
+    hardest_objects,
+    stated_chances,
+    stop_reasons,
+)
 from utils.runs import origin_of, this_python
 from utils.statistics import FEW_ROUNDS, Difference
 from utils.transforms import Grasp, RGBDFrame
 
+HARDEST = 10  # objects that are listed, at which most attempts failed
 VIDEO_TYPES = {".gif": "image/gif", ".mp4": "video/mp4", ".webm": "video/webm"}
 
 
@@ -94,6 +102,7 @@ def write_report(
         failures_in_words=failures_in_words,
         depth_in_words=depth_in_words,
         stops=stop_reasons(rounds),
+        hardest=hardest_objects(rounds, HARDEST),
         reliability=_reliability(rounds),
         has_arm=config.robot.arm != "none",
         targets_known=any(row.targets for row in rows),

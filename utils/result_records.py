@@ -89,6 +89,7 @@ class AttemptRecord:
     tilt: rad of the executed grasp's approach from straight above.
     roughness: m, of the table in the frame that the planner saw; 0 where it saw the truth, None
         without a grasp and in older files.
+    aimed: name of the object nearest to the planned grasp; None without a grasp and in older files.
     """
 
     success: bool
@@ -105,6 +106,7 @@ class AttemptRecord:
     graspable: bool = True
     tilt: float = 0.0
     roughness: float | None = None
+    aimed: str | None = None
 
     def __post_init__(self) -> None:
         if self.reason != SUCCESS and self.reason not in FAILURES:
@@ -297,12 +299,12 @@ _ROUND_TYPES = {
 _ATTEMPT_TYPES = {
     "success": bool, "reason": str, "plan_seconds": float, "sim_seconds": float, "graspable": bool,
     "turn_ms": float, "turn_ms_mean": float, "detail": str, "held": str, "turned": float,
-    "slid": float, "tilt": float, "roughness": float,
+    "slid": float, "tilt": float, "roughness": float, "aimed": str,
 }  # fmt: skip
 _ADDED = {  # missing in older files
     "controller": OPEN_LOOP, "ungraspable": 0, "target_in_hand": None, "randomization": None,
     "graspable": True, "turn_ms": None, "turn_ms_mean": None, "detail": "", "held": None,
-    "turned": None, "slid": None, "tilt": 0.0, "roughness": None,
+    "turned": None, "slid": None, "tilt": 0.0, "roughness": None, "aimed": None,
 }  # fmt: skip
 _MAY_BE_NONE = [name for name, value in _ADDED.items() if value is None]
 _GRASP_NUMBERS = ("angle", "depth", "width", "quality")
@@ -396,9 +398,10 @@ def read_sample(path: Path) -> Sample:
 
 
 def without_times(record: RoundRecord) -> RoundRecord:
-    """The record without its wall-clock times, in which alone two equal rounds differ."""
+    """The record without its wall-clock times, in which alone two equal rounds differ, and without
+    what older files lack and the rest tells."""
     attempts = tuple(
-        replace(attempt, plan_seconds=0.0, turn_ms=None, turn_ms_mean=None)
+        replace(attempt, plan_seconds=0.0, turn_ms=None, turn_ms_mean=None, aimed=None)
         for attempt in record.attempts
     )
     return replace(record, attempts=attempts)

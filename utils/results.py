@@ -232,6 +232,42 @@ def stop_reasons(rounds: Iterable[RoundRecord]) -> list[StopReason]:
     ]
 
 
+# --- Which objects fail ---------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class ObjectOutcomes:
+    """What became of the attempts at one object of a set, in all scenarios and depth noises.
+
+    outcomes: by policy, failed and all attempts. An attempt belongs to the object that the hand
+    held, or else to the one nearest to the planned grasp.
+    """
+
+    objects: str
+    name: str
+    outcomes: dict[str, tuple[int, int]]
+
+    @property
+    def failures(self) -> int:
+        return sum(failed for failed, _ in self.outcomes.values())
+
+
+def hardest_objects(rounds: Iterable[RoundRecord], count: int) -> list[ObjectOutcomes]:
+    """Up to `count` objects at which attempts have failed, those with the most failures first; none
+    of records from older files, which do not tell where a grasp aimed."""
+    found: dict[tuple[str, str], ObjectOutcomes] = {}
+    for record in rounds:
+        for attempt in record.attempts:
+            name = attempt.held or attempt.aimed
+            if name is None or attempt.aimed is None:
+                continue
+            one = found.setdefault((record.objects, name), ObjectOutcomes(record.objects, name, {}))
+            failed, tried = one.outcomes.get(record.policy, (0, 0))
+            one.outcomes[record.policy] = failed + (not attempt.success), tried + 1
+    failing = [one for one in found.values() if one.failures]
+    return sorted(failing, key=lambda one: -one.failures)[:count]
+
+
 # --- Comparisons --------------------------------------------------------------------------------
 
 
