@@ -15,10 +15,11 @@ from __future__ import annotations
 import argparse
 import io
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
+import cv2
 import gymnasium
 import imageio.v2 as imageio
 import numpy as np
@@ -39,6 +40,7 @@ _LIGHT = {"shadow": 1, "lightDirection": (0.6, -0.7, 1.6), "lightAmbientCoeff": 
 FILM_RATE, FILM_SIZE = 6, (480, 368)  # Hz of simulated time; width and height, pixels
 SCENE = "scene.png"  # the picture of a scene, where no name is given
 _HOLD = 6  # pictures for which the last one of an episode stays
+_QUICK = cv2.IMWRITE_PNG_COMPRESSION, 1  # the least
 _SPEED = 2.0  # of a film, in multiples of real time
 
 
@@ -73,21 +75,26 @@ class Studio:
 
 
 class Film:
-    """Films a cell from now on until it is stopped, at the end of a `with` block at the latest.
+    """Films a cell from now on until it is stopped, at the end of a `with` block at the latest. It
+    keeps its pictures as PNG: a round of a minute would take 200 MB otherwise.
 
     rate: pictures a second of simulated time. size: width and height, pixels.
     """
 
     def __init__(self, cell: Cell, rate: float = FILM_RATE, size: tuple[int, int] = FILM_SIZE):
         self._cell, self._studio, self._rate = cell, Studio(cell, *size), rate
-        self._pictures: list[np.ndarray] = []
+        self._pictures: list[np.ndarray] = []  # encoded
         self._stopped = False
         self._every = max(1, round(1 / (rate * cell.dt)))
         cell.on_step = self._on_step
 
     def _on_step(self, cell: Cell) -> None:
         if cell.steps % self._every == 0:
-            self._pictures.append(self._studio.picture())
+            self._keep()
+
+    def _keep(self) -> None:
+        picture = cv2.cvtColor(self._studio.picture(), cv2.COLOR_RGB2BGR)
+        self._pictures.append(cv2.imencode(".png", picture, _QUICK)[1])
 
     def __enter__(self) -> Self:
         return self
@@ -100,12 +107,12 @@ class Film:
         self._stopped, self._cell.on_step = True, None
         self._studio.close()
 
-    def stop(self) -> list[np.ndarray]:
-        """Stop filming; returns the pictures, (H, W, 3) uint8 each."""
+    def stop(self) -> Iterator[np.ndarray]:
+        """Stop filming; gives the pictures, (H, W, 3) uint8 each."""
         if not self._pictures:  # the arm has not moved: at least show the scene
-            self._pictures.append(self._studio.picture())
+            self._keep()
         self._end()
-        return self._pictures
+        return (cv2.imdecode(one, cv2.IMREAD_COLOR_RGB) for one in self._pictures)
 
     def encoded(self, ending: str) -> bytes:
         """Stop filming; returns a file that runs at twice real time. ending: its name's, "mp4" or
@@ -135,7 +142,7 @@ def write_film(path: Path, pictures: Sequence[np.ndarray], rate: float) -> None:
     write_atomic(path, _encoded(path.suffix[1:], [*pictures, *[pictures[-1]] * _HOLD], rate))
 
 
-def _encoded(ending: str, pictures: Sequence[np.ndarray], rate: float) -> bytes:
+def _encoded(ending: str, pictures: Iterable[np.ndarray], rate: float) -> bytes:
     """A film as the bytes of a file whose name ends so."""
     if ending == "gif":
         return imageio.mimwrite("<bytes>", pictures, format="gif", duration=1000 / rate, loop=0)

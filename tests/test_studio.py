@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from envs import studio
-from envs.studio import check_files, write_film, write_rgbd
+from envs.studio import Film, check_files, write_film, write_rgbd
 from utils.errors import UserError
 from utils.transforms import RGBDFrame
 
@@ -71,3 +71,22 @@ def test_a_film_that_could_not_be_finished_leaves_the_one_before(tmp_path, endin
         write_film(path, [*PICTURES, no_picture], 6.0)
     assert path.read_bytes() == before
     assert [file.name for file in path.parent.iterdir()] == [path.name]
+
+
+def test_a_film_keeps_its_pictures_small_and_bit_for_bit(cell) -> None:
+    shown = []
+    with Film(cell, rate=60, size=(120, 92)) as film:
+        take = film._studio.picture
+        film._studio.picture = lambda: shown.append(take()) or shown[-1]
+        cell.step(40)
+        kept = sum(one.nbytes for one in film._pictures)
+        pictures = list(film.stop())
+    assert len(pictures) == len(shown) > 5 and cell.on_step is None
+    np.testing.assert_array_equal(pictures, shown)
+    assert kept < sum(picture.nbytes for picture in shown) / 3
+
+
+def test_a_film_ends_with_what_it_shows(cell) -> None:
+    with pytest.raises(RuntimeError), Film(cell):
+        raise RuntimeError
+    assert cell.on_step is None
