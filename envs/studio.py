@@ -145,8 +145,13 @@ def write_film(path: Path, pictures: Sequence[np.ndarray], rate: float) -> None:
 def _encoded(ending: str, pictures: Iterable[np.ndarray], rate: float) -> bytes:
     """A film as the bytes of a file whose name ends so."""
     if ending == "gif":
-        return imageio.mimwrite("<bytes>", pictures, format="gif", duration=1000 / rate, loop=0)
-    return imageio.mimwrite("<bytes>", pictures, format=ending, fps=rate, quality=6)
+        gif = {"format": "gif", "duration": 1000 / rate, "loop": 0}
+        return imageio.mimwrite("<bytes>", list(pictures), **gif)
+    file = io.BytesIO()
+    with imageio.get_writer(file, format=ending, mode="I", fps=rate, quality=6) as writer:
+        for picture in pictures:  # one by one: they may be many
+            writer.append_data(picture)
+    return file.getvalue()
 
 
 def write_rgbd(frame: RGBDFrame, folder: Path, scene: np.ndarray | None = None) -> list[str]:
