@@ -155,7 +155,7 @@ def test_rounds_whose_last_objects_fell_off_are_told():
 
 
 def test_an_attempt_belongs_to_what_was_held_or_else_to_what_it_aimed_at():
-    """Of three attempts at the mug one failed with the bowl in the hand; older files tell nothing."""
+    """Of three attempts at the mug one failed with the bowl in the hand; older files lack it."""
     at_mug = replace(attempt("success"), aimed="mug")
     missed = replace(attempt("missed"), aimed="mug")
     other = replace(attempt("slipped"), aimed="mug", held="bowl")
