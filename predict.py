@@ -19,10 +19,10 @@ The grasps are those of a planner (docs/planner.md): --planner graspnet, graspne
 heuristic6d, whose hand comes from any side, or graspnet6d, which leans it where it has to.
 --checkpoint takes a network of your own. The planner works on the square of the table that holds
 all matter above it, or on --workspace X Y SIZE, its centre and side in the world. One object is
-named by a pixel on it (--point U V), by a box around it (--box U0 V0 U1 V1, the object that fills
-most of it), or by its pixels (--mask FILE, a PNG or NPY of the image's size, not 0 where the object
-is), which alone part two objects that touch where the planner sees one, and join the pieces in
-which planners with a network see one of more than 10 cm. Then all grasps are of that object, and
+named by a pixel on it (--point U V), by a box drawn around it (--box U0 V0 U1 V1), or by its pixels
+(--mask FILE, a PNG or NPY of the image's size, not 0 where the object is), which alone part two
+objects that touch where the planner sees one, and join the pieces in which planners with a network
+see one of more than 10 cm. Then all grasps are of that object, and
 `clearing` holds grasps that first move aside what is in its way.
 
 Without --table-height the table is the dominant plane of the depth image. Without --camera-pose the

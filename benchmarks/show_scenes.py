@@ -51,13 +51,12 @@ def main(argv: Sequence[str] | None = None) -> None:
 def film(config: Config, layout: str, objects: str) -> list[np.ndarray]:
     """Pictures (H, W, 3) uint8 of one round."""
     scene = make_scene(layout, load_objects(objects, config), config.seed, config)
-    with make_cell(config) as cell:
-        filming = Film(cell, _RATE, _SIZE)
+    with make_cell(config) as cell, Film(cell, _RATE, _SIZE) as filming:
         record = run_round(
             cell, scene, new_planner(PLANNER, config), policy=PLANNER, objects=objects,
             max_failures=config.evaluate.max_failures, abstain=config.evaluate.abstain,
         )  # fmt: skip
-        pictures = filming.stop()
+        pictures = list(filming.stop())
     outcome = f"{layout}: {record.objects_cleared} of {record.objects_total} in the tray"
     outcome += f", {len(record.attempts)} attempts"
     print(outcome)
