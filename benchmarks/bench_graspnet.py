@@ -20,7 +20,7 @@ import torch
 
 from benchmarks.metrics import Metric, benchmark_parser, median_ratio, report
 from envs.cell_scenes import make_scene
-from envs.objects import load_object_set
+from envs.objects import load_object_set, load_objects
 from envs.simulators import make_cell
 from models.graspnet import GraspNet, create_model, to_input
 from models.graspnet_backbones import BACKBONES
@@ -194,10 +194,7 @@ def seconds(work: Callable[[], object]) -> float:
 def label_metrics(model: GraspNet, count: int) -> list[Metric]:
     """The network's top grasps against the dense labels of scenes of test objects."""
     config = load_config(None, ["sim.renderer=tiny"])
-    sets = [
-        load_object_set(name, cache_dir=config.cache_folder, **config.objects.model_dump())
-        for name in ("random_urdfs", "primitives")
-    ]
+    sets = [load_objects(name, config) for name in ("random_urdfs", "primitives")]
     workspace = config.workspace.geometry
     images = []
     with make_cell(config) as cell:

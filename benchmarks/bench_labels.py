@@ -24,7 +24,7 @@ from envs.cell import Cell
 from envs.cell_layout import Scene
 from envs.cell_scenes import make_scene
 from envs.data_generation import execute_pairs
-from envs.objects import load_object_set
+from envs.objects import load_objects
 from envs.simulators import make_cell
 from utils.config import Config, load_config
 from utils.geometry import GripperGeometry, Workspace
@@ -59,9 +59,7 @@ def main(argv: Sequence[str] | None = None) -> None:
 
 
 def training_scenes(config: Config, count: int, first_seed: int) -> list[Scene]:
-    names = ("primitives", "random_urdfs")
-    given = config.objects.model_dump()
-    sets = [load_object_set(name, cache_dir=config.cache_folder, **given) for name in names]
+    sets = [load_objects(name, config) for name in ("primitives", "random_urdfs")]
     return [
         make_scene(LAYOUTS[i % len(LAYOUTS)], sets[i % 2], first_seed + i, config)
         for i in range(count)

@@ -17,7 +17,7 @@ from tqdm import tqdm
 
 from benchmarks.metrics import Metric, benchmark_parser, natural_number, positive_int, report
 from envs.cell_scenes import make_scene
-from envs.objects import load_object_set
+from envs.objects import load_objects
 from envs.simulators import make_cell
 from models import graspnet_objects
 from models.graspnet_io import SHIPPED
@@ -75,10 +75,7 @@ def told_apart(
     config: Config, layout: str, name: str, seeds: Sequence[int]
 ) -> Iterator[np.ndarray]:
     """(M, 2) bool of each scene: which of its objects are cut, and which are joined."""
-    objects = load_object_set(
-        name, cache_dir=config.cache_folder, max_opening=config.gripper.max_opening,
-        **config.objects.model_dump(),
-    )  # fmt: skip
+    objects = load_objects(name, config)
     workspace, network = config.workspace.geometry, loaded(SHIPPED)
     with make_cell(config) as cell:
         for seed in seeds:

@@ -19,7 +19,7 @@ from benchmarks.metrics import Metric, benchmark_parser, positive_int, report
 from envs.cell import Cell
 from envs.cell_scenes import make_scene
 from envs.closed_loop_tracker import WristCamera
-from envs.objects import load_object_set
+from envs.objects import load_objects
 from envs.robot_kinematics import UnreachableError, choose_posture, moved
 from envs.simulators import make_cell
 from models.planners import make_planner
@@ -67,7 +67,7 @@ def measure(cell: Cell, objects: str, scenes: int, views: int) -> dict[float, Er
     """Errors by height over the grasp, on `scenes` scenes of an object set."""
     config = cell.config
     workspace = config.workspace.geometry
-    chosen = load_object_set(objects, cache_dir=config.cache_folder, **config.objects.model_dump())
+    chosen = load_objects(objects, config)
     errors = {height: Errors() for height in HEIGHTS}
     for seed in range(config.seed * 100_000, config.seed * 100_000 + scenes):
         cell.load(make_scene("isolated", chosen, seed, config))

@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 
 from envs.cell_scenes import LAYOUTS, make_scene
-from envs.objects import load_object_set
+from envs.objects import load_objects
 from envs.simulators import make_cell
 from models.photographs import frame_of, photographs
 from utils.config import Config
@@ -71,7 +71,7 @@ def main(argv: Sequence[str] | None = None) -> None:
 
 def frames_of(config: Config, objects: str, layout: str) -> dict[str, RGBDFrame]:
     """The same scene's first frame without noise and with each known one."""
-    models = load_object_set(objects, cache_dir=config.cache_folder, **config.objects.model_dump())
+    models = load_objects(objects, config)
     scene = make_scene(layout, models, config.seed, config)
     frames = {}
     for name in (CLEAN, *DEPTH_NOISES):

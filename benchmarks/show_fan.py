@@ -18,9 +18,10 @@ import numpy as np
 
 from envs.cell import Cell, Intrinsics
 from envs.cell_scenes import make_scene
-from envs.evaluation_worker import load_objects, new_planner
+from envs.evaluation_worker import new_planner
 from envs.execution import reaches
 from envs.next_grasp import first_untried, within_reach
+from envs.objects import load_objects
 from envs.robot_kinematics import choose_posture
 from envs.second_look import CM3, SecondLook
 from envs.simulators import make_cell

@@ -18,7 +18,7 @@ from envs.cell_scenes import make_scene
 from envs.closed_loop import ClosedLoop
 from envs.closed_loop_tracker import WristImage
 from envs.execution import execute_grasp
-from envs.objects import load_object_set
+from envs.objects import load_objects
 from envs.robot_kinematics import forward_kinematics
 from envs.scenarios import SCENARIOS, disturbed, teach
 from envs.simulators import make_cell
@@ -47,9 +47,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     if names:
         check_writable("FILE", Path(file))
     config = load_config(None, overrides)
-    objects = load_object_set(
-        "random_urdfs", cache_dir=config.cache_folder, **config.objects.model_dump()
-    )
+    objects = load_objects("random_urdfs", config)
     workspace = config.workspace.geometry
     plan = make_planner("heuristic", GripperGeometry(), workspace, config.seed)
     with make_cell(config) as cell:

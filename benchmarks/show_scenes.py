@@ -14,7 +14,8 @@ import cv2
 import numpy as np
 
 from envs.cell_scenes import make_scene
-from envs.evaluation_worker import load_objects, new_planner
+from envs.evaluation_worker import new_planner
+from envs.objects import load_objects
 from envs.rounds import run_round
 from envs.simulators import make_cell
 from envs.studio import Film, write_film

@@ -16,7 +16,7 @@ import numpy as np
 from envs.cell import Cell, Intrinsics
 from envs.cell_scenes import LAYOUTS, make_scene
 from envs.mujoco_cell import MujocoCell
-from envs.objects import load_object_set
+from envs.objects import load_objects
 from envs.simulators import cell_class
 from envs.studio import SCENIC_EYE, SCENIC_TARGET
 from utils.image_overlay import picture_path, write_picture
@@ -38,9 +38,7 @@ def main(argv: Sequence[str] | None = None) -> None:
 
     summary = "Show one scene in both simulators."
     config, chosen = parse_args(argv, summary, options, resumes=False)
-    objects = load_object_set(
-        chosen.objects, cache_dir=config.cache_folder, **config.objects.model_dump()
-    )
+    objects = load_objects(chosen.objects, config)
     scene = make_scene(chosen.layout, objects, config.seed, config)
     with cell_class("pybullet")(config) as bullet, MujocoCell(config) as mujoco:
         for cell in (bullet, mujoco):

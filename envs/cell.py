@@ -16,11 +16,10 @@ import numpy as np
 from typing_extensions import Self
 
 from envs.board import Board
-from envs.cell_layout import EMPTY, TRAY_HEIGHT, Box, Scene, on_table
+from envs.cell_layout import EMPTY, TRAY_HEIGHT, Box, Scene, on_table, side_view
 from envs.robot import Robot
 from envs.robot_kinematics import JOINT_LOWER, JOINT_UPPER, tip_position
 from envs.robot_safety import ArmGate
-from envs.views import side_view
 from utils.config import CameraConfig, Config
 from utils.config_types import changed_in
 from utils.depth import seeded_noise
@@ -224,15 +223,10 @@ class Cell(ABC):
         shows all that there is. `mirror` has it show the state of another cell. Close it."""
         return None
 
+    @abstractmethod
     def randomizable(self) -> Randomizable:
         """The scene as built, whose physics and colours can be changed: the same object until the
-        next build. Raises UserError in a simulator that does not implement it."""
-        raise not_randomizable(self.config)
-
-    @classmethod
-    def can_be_randomized(cls) -> bool:
-        """Whether cells of this class implement `randomizable`."""
-        return cls.randomizable is not Cell.randomizable
+        next build."""
 
     @abstractmethod
     def close(self) -> None:
@@ -471,14 +465,6 @@ def require_arm(config: Config, what: str) -> None:
     """Raise UserError where the cell has a hand without an arm."""
     if config.robot.arm == "none":
         raise UserError(f"robot.arm=none: {what} needs the whole arm; set robot.arm=panda")
-
-
-def not_randomizable(config: Config) -> UserError:
-    """The error for a simulator whose cells do not implement `Cell.randomizable`."""
-    return UserError(
-        f"simulator={config.simulator}: its cell cannot be randomised; set "
-        "evaluate.randomise=false, or use simulator=pybullet or simulator=mujoco"
-    )
 
 
 def _box(config: Config) -> tuple[list[float], list[float]]:

@@ -305,7 +305,8 @@ def _lowest(model: ObjectModel, rotation: Rotation) -> float:
     return min(float(rotation.apply(part)[:, 2].min()) for part in model.parts)
 
 
-# The layouts, whose places here are part of the scenes' seeds: a new one stands at the end.
+# The layouts, whose places here are part of the scenes' seeds: a new one stands at the end (number
+# 11 is taken, see `utils.random_streams`: in `make_scene` the next one's seed needs a third number)
 ARRANGEMENTS = {
     "isolated": _drop_one, "packed": _stand_upright, "pile": _pile_up, "dense": _pile_up,
     "bin": _pile_up, "household": _pile_up, "tall": _stand_close, "wall": _lean, "flat": _overhang,

@@ -20,8 +20,10 @@ from typing_extensions import Self
 
 from envs.object_files import FineVisual
 from envs.object_shapes import NativeShape
-from utils.config import Config
+from utils.config import CameraConfig, Config, WorkspaceConfig
 from utils.geometry import TRAY_CENTRE, TRAY_HALF_SIZE, TRAY_WALL, ConvexSolid
+from utils.random_streams import Stream
+from utils.transforms import look_at
 
 GRAVITY = 9.81  # m/s^2
 
@@ -169,6 +171,23 @@ class Viewpoint:
     position: tuple[float, float, float]
     target: tuple[float, float, float]
     up: tuple[float, float, float]
+
+
+def side_view(camera: CameraConfig, workspace: WorkspaceConfig, seed: int) -> np.ndarray:
+    """(4, 4) T_WC of a camera that looks at the workspace's centre on the table from the side.
+
+    Tilt, distance and azimuth are uniform in their ranges; the same seed gives the same pose.
+    """
+    rng = np.random.default_rng([seed, Stream.SIDE_VIEW])
+    tilt, azimuth = (
+        np.radians(rng.uniform(*bounds))
+        for bounds in (camera.side_tilt_deg, camera.side_azimuth_deg)
+    )
+    level, up = np.sin(tilt), np.cos(tilt)
+    outwards = np.array([level * np.cos(azimuth), level * np.sin(azimuth), up])
+    centre = np.array([*workspace.center, 0.0])
+    eye = centre + rng.uniform(*camera.side_distance) * outwards
+    return look_at(eye, centre, (0.0, 0.0, 1.0))
 
 
 @dataclass(frozen=True)

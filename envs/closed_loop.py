@@ -113,13 +113,10 @@ class LoopRecord:
     """What a closed loop did, for tests and figures.
 
     turn_seconds: wall-clock time of every turn of the loop, from the image to the joint velocities,
-    without rendering. seconds, errors: simulated time and the law's correction (6,) in C at every
-    turn of the near stage. stage: the last stage that was reached: far, near, final or closing.
+    without rendering. stage: the last stage that was reached: far, near, final or closing.
     """
 
     turn_seconds: list[float] = field(default_factory=list)
-    seconds: list[float] = field(default_factory=list)
-    errors: list[np.ndarray] = field(default_factory=list)
     stage: str = "far"
 
 
@@ -255,8 +252,6 @@ class GuidedApproach:
         step = law.step(view, goal)
         if self.near:
             self.loop.record.stage = "near"
-            self.loop.record.seconds.append(now)
-            self.loop.record.errors.append(step.correction)
             if self._may_commit(off):
                 return self._pose_at_goal(T_WE, step.correction)
         self.desired = self._joint_velocities(q, T_WE, step.velocity, law, sink)

@@ -25,7 +25,7 @@ from envs.cell_appearance import Appearance, draw_camera
 from envs.cell_layout import Scene
 from envs.cell_scenes import SceneError, make_scene
 from envs.execution import check_tray, execute_grasp
-from envs.objects import OBJECT_SETS, ObjectSet, load_object_set
+from envs.objects import OBJECT_SETS, ObjectSet, load_objects
 from envs.simulators import cell_class
 from utils.atomic_files import write_atomic
 from utils.config import Config, dump_config, load_config, with_settings
@@ -117,7 +117,7 @@ def content_of_sets(config: Config, names: Iterable[str]) -> dict[str, str]:
     for name in names:
         if name in OBJECT_SETS:
             continue
-        objects = _training_objects(config, name)
+        objects = load_objects(name, config, "train")
         sources, parts = objects.sources(), [modules[name]] if name in modules else []
         if sources or not parts:
             parts.append(_digest(Path(name).expanduser(), sources))
@@ -150,11 +150,15 @@ def generate(config: Config, rank: int = 0, ranks: int = 1) -> Path:
     However the generation ends, it finishes the shards under way and begins no others.
     """
     require_arm(config, "the generation of training data")
-    if config.camera.view != "fixed":
-        raise UserError(
-            f"camera.view={config.camera.view}: training images are taken around camera.position; "
-            "set camera.view=fixed"
-        )
+    for key, value, needed in (
+        ("view", config.camera.view, "fixed"),
+        ("mount", config.camera.mount, "overhead"),
+    ):
+        if value != needed:
+            raise UserError(
+                f"camera.{key}={value}: training images are taken around camera.position; set "
+                f"camera.{key}={needed}"
+            )
     away = np.subtract(config.camera.position, config.camera.target)
     if config.data.randomise and np.arctan2(np.hypot(*away[:2]), away[2]) > _STRAIGHT:
         raise UserError(
@@ -271,7 +275,7 @@ def object_sets(config: Config) -> dict[tuple[str, str], ObjectSet]:
     """Return the training objects of each set by (set, split); no test object is among them."""
     parts = {}
     for name in config.data.object_sets:
-        whole = _training_objects(config, name)
+        whole = load_objects(name, config, "train")
         shapes = _by_shape(whole)
         if len(shapes) < 2:
             raise UserError(
@@ -292,13 +296,6 @@ def _by_shape(objects: ObjectSet) -> list[list[int]]:
     for index in range(len(objects)):
         found.setdefault(objects.shape_name(index), []).append(index)
     return list(found.values())
-
-
-def _training_objects(config: Config, name: str) -> ObjectSet:
-    settings = config.objects.model_dump() | {"split": "train"}
-    return load_object_set(
-        name, max_opening=config.gripper.max_opening, cache_dir=config.cache_folder, **settings
-    )
 
 
 _sets_of = kept(object_sets)

@@ -96,9 +96,9 @@ class Observer:
         """Read the robot and the nearest object. Raises PhysicsError on a non-finite number."""
         cell = self._cell
         state = cell.robot.state()
-        self.state = np.array(state, np.float32)
         if not math.isfinite(sum(state)):
             raise PhysicsError("the robot's state is not finite")
+        self.state = np.array(state, np.float32)
         self.T_WE = cell.robot.tip_pose()
         self.tip = self.T_WE[:3, 3]
         poses = [cell.object_pose(i) for i in range(len(cell.bodies))]

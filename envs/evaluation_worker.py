@@ -9,11 +9,14 @@ from __future__ import annotations
 
 from contextlib import nullcontext
 
+import numpy as np
+
 from envs.cell import camera_intrinsics, require_arm
+from envs.cell_arrangements import viewpoint_of
 from envs.cell_scenes import TARGET_LAYOUT, check_suited, make_scene
 from envs.closed_loop import check_watchdog
 from envs.execution import GraspOutcome, check_tray
-from envs.objects import OBJECT_SETS, ObjectSet, load_object_set, prepare
+from envs.objects import OBJECT_SETS, load_objects, prepare
 from envs.policy_approach import (
     PolicyApproach,
     check_learned,
@@ -25,7 +28,6 @@ from envs.rounds import run_round
 from envs.scenarios import SCENARIOS
 from envs.simulators import make_cell
 from envs.studio import Film
-from envs.views import check_sees_workspace
 from models.planner_target import check_takes_targets
 from models.planners import (
     Planner,
@@ -35,7 +37,7 @@ from models.planners import (
     needs_truth,
     tilts,
 )
-from utils.config import Config
+from utils.config import CameraConfig, Config, WorkspaceConfig
 from utils.errors import UserError
 from utils.evaluation import FilmFile, Task, TaskResult, policies_of, with_depth_noise
 from utils.executor import open_executor
@@ -43,7 +45,7 @@ from utils.report import picture, set_in_words
 from utils.result_formats import depth_in_words
 from utils.result_records import CLEAN, OPEN_LOOP, policy_name
 from utils.runs import portable_name
-from utils.transforms import Grasp, RGBDFrame
+from utils.transforms import Grasp, RGBDFrame, look_at, project
 from utils.worker_process import kept
 
 # --- In the main process, before any work is done --------------------------------------------
@@ -81,14 +83,16 @@ def check_everything(config: Config, key: str = "evaluate.policies") -> None:
             )
     if config.evaluate.second_look > 0:
         require_arm(config, "evaluate.second_look, whose camera is in the arm's hand,")
-    check_sees_workspace(config.camera, camera_intrinsics(config.camera).K, config.workspace)
+    layouts = {SCENARIOS[scenario].layout for scenario in config.evaluate.scenarios}
+    if any(viewpoint_of(layout, config) is None for layout in layouts):
+        check_sees_workspace(config.camera, camera_intrinsics(config.camera).K, config.workspace)
     with make_cell(config) as cell:
         if any(controller != OPEN_LOOP for _, controller in policies_of(config)):
             for scenario in config.evaluate.scenarios:
                 check_watchdog(cell, scenario)
     if config.robot.arm != "none":
         check_tray(config)
-    sets = {name: load_objects(name, config) for name in config.evaluate.object_sets}
+    sets = {name: objects_of(name, config) for name in config.evaluate.object_sets}
     with open_executor(config.compute, config.evaluate.workers) as workers:
         for name, objects in sets.items():
             if name not in OBJECT_SETS:
@@ -97,18 +101,34 @@ def check_everything(config: Config, key: str = "evaluate.policies") -> None:
                 check_suited(SCENARIOS[scenario].layout, objects, config)
 
 
+def check_sees_workspace(camera: CameraConfig, K: np.ndarray, workspace: WorkspaceConfig) -> None:
+    """Raise UserError where a fixed camera with intrinsics K shows no place of the workspace.
+
+    No planner would find a grasp, and every policy would be scored with 0 %. Cameras of other
+    mounts and views follow the hand or the workspace.
+    """
+    if camera.mount != "overhead" or camera.view != "fixed":
+        return
+    steps = np.linspace(-0.5, 0.5, 21) * workspace.size
+    x, y = np.meshgrid(workspace.center[0] + steps, workspace.center[1] + steps)
+    places = np.stack([x, y, np.zeros_like(x)], axis=-1)
+    T_WC = look_at(camera.position, camera.target, camera.up)
+    pixels, depth = project(places, K, T_WC)
+    last = np.array([camera.width, camera.height]) - 0.5
+    inside = ((pixels > -0.5) & (pixels < last)).all(axis=-1)
+    if not (inside & (depth > camera.near) & (depth < camera.far)).any():
+        raise UserError(
+            "camera: sees nothing of the workspace, the square of the table with the side "
+            f"{workspace.size:g} m around ({workspace.center[0]:g}, {workspace.center[1]:g}); "
+            "point camera.target there, or change camera.position, camera.fov_deg, camera.near or "
+            "camera.far"
+        )
+
+
 def privileged_policies(config: Config) -> set[str]:
     """The policies of the evaluation whose planners see the true scene."""
     planned = [name for name in config.evaluate.policies if not is_learned(name)]
     return {name for name in planned if needs_truth(new_planner(name, config))}
-
-
-@kept
-def load_objects(name: str, config: Config) -> ObjectSet:
-    return load_object_set(
-        name, max_opening=config.gripper.max_opening, cache_dir=config.cache_folder,
-        **config.objects.model_dump(),
-    )  # fmt: skip
 
 
 def new_planner(name: str, config: Config, key: str = "evaluate.policies") -> Planner:
@@ -119,6 +139,7 @@ def new_planner(name: str, config: Config, key: str = "evaluate.policies") -> Pl
 # --- In a worker process ----------------------------------------------------------------------
 
 cell_of = kept(make_cell)
+objects_of = kept(load_objects)
 planner_of = kept(new_planner)  # is reset for every round
 
 
@@ -130,7 +151,7 @@ def approach_of(name: str, config: Config) -> PolicyApproach:
 
 def work(config: Config, task: Task) -> TaskResult:
     """Let each policy of a task work on its scene."""
-    objects = load_objects(task.objects, config)
+    objects = objects_of(task.objects, config)
     objects.told = True  # by the main process, which prepares the sets
     scene = make_scene(SCENARIOS[task.scenario].layout, objects, task.seed, config)
     result = TaskResult()

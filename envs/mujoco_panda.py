@@ -325,10 +325,6 @@ class MujocoPanda(MujocoHand, Robot):
         """(4, 4) T_WE."""
         return forward_kinematics(self.q)
 
-    def closing_direction(self) -> np.ndarray:
-        """(3,) unit vector in W along E's y axis."""
-        return self.tip_pose()[:3, 1]
-
     # --- Motion -------------------------------------------------------------------------------
 
     def place(self, q: np.ndarray, opening: float | None = None) -> None:
@@ -419,10 +415,6 @@ class MujocoFloatingHand(MujocoHand, FloatingHand):
         super().__init__(dt, gripper, grip_force)
         self._compile(spec, substeps)
         self._yields, self._reference = False, np.zeros(3)
-
-    def closing_direction(self) -> np.ndarray:
-        """(3,) unit vector in W along E's y axis."""
-        return self.tip_pose()[:3, 1]
 
     def yield_to_fingers(self) -> None:
         self._send(self._yield)

@@ -37,6 +37,7 @@ from envs.object_primitives import (
 )
 from envs.pybullet_files import data_folder
 from models.graspable import is_graspable
+from utils.config import Config
 from utils.config_types import AUTO
 from utils.errors import UserError, did_you_mean, one_line
 from utils.executor import Workers, completed
@@ -207,6 +208,14 @@ def load_object_set(
     if is_folder(name_or_path):
         return _folder(Path(name_or_path), settings)
     return _plugin(name_or_path, settings)
+
+
+def load_objects(name: str, config: Config, split: Split | None = None) -> ObjectSet:
+    """`load_object_set` with a config's settings. split: None for the config's."""
+    settings = config.objects.model_dump() | ({} if split is None else {"split": split})
+    return load_object_set(
+        name, max_opening=config.gripper.max_opening, cache_dir=config.cache_folder, **settings
+    )
 
 
 def check_object_set(name_or_path: str, where: str) -> None:

@@ -21,30 +21,20 @@ from utils.geometry import GripperGeometry
 from utils.transforms import transform_points
 
 WHITE = (1.0, 1.0, 1.0, 1.0)
-# Of the parts of the real robot, for pictures; all others are white.
-_COLOURS = {
-    "link0": (0.90, 0.92, 0.93, 1.0),
-    "link5": (0.90, 0.92, 0.93, 1.0),
-    "link7": (0.90, 0.92, 0.93, 1.0),
-    "hand": (0.35, 0.36, 0.38, 1.0),
-    "finger": (0.20, 0.20, 0.22, 1.0),
-}
 
 
 def write_panda(
     cache_dir: Path,
     gripper: GripperGeometry,
-    fine: bool = False,
     meshes: Mapping[str, Path] | None = None,
     arm: bool = True,
 ) -> Path:
     """Write the robot with welded links into the cache folder; the URDF's path.
 
-    fine: for pictures, which show `meshes`, the detailed mesh of each part, or the shapes of the
-    physics in the real robot's colours where a part has none. Otherwise those shapes are white.
+    meshes: for pictures, of each part the detailed mesh, which brings its own colours. Other parts
+    are shown as the shapes of the physics, in white.
     arm: False for the hand alone (`floating_links`).
     """
-    shown = meshes if fine and meshes else {}
     files: dict[str, bytes] = {}
     robot = ElementTree.Element("robot", name="panda")
     for link in welded(panda_links(gripper) if arm else floating_links(gripper)):
@@ -55,7 +45,7 @@ def write_panda(
         for shape in link.shapes:
             files[f"{shape.part}.obj"] = _obj(shape.hull)
             _add_mesh(element, "collision", shape.T, f"{shape.part}.obj")
-            _add_picture(element, shape, shown, fine)
+            _add_picture(element, shape, meshes or {})
         if link.joint is not None:
             _add_joint(robot, link, link.joint)
     ElementTree.indent(robot)  # PyBullet takes no line of more than some 1,000 characters
@@ -135,15 +125,11 @@ def _add_surface(link: ElementTree.Element, surface: Surface) -> None:
     _add(element, "damping", value=surface.damping)
 
 
-def _add_picture(
-    link: ElementTree.Element, shape: Shape, meshes: Mapping[str, Path], coloured: bool
-) -> None:
-    """What cameras see; a detailed mesh brings its own colours."""
-    mesh = meshes.get(shape.part)
-    element = _add_mesh(link, "visual", shape.T, str(mesh or f"{shape.part}.obj"))
-    colour = _COLOURS.get(shape.part, WHITE) if coloured and mesh is None else WHITE
-    material = _add(element, "material", name="_".join(f"{c:g}" for c in colour))
-    _add(material, "color", rgba=colour)
+def _add_picture(link: ElementTree.Element, shape: Shape, meshes: Mapping[str, Path]) -> None:
+    """What cameras see."""
+    element = _add_mesh(link, "visual", shape.T, str(meshes.get(shape.part, f"{shape.part}.obj")))
+    material = _add(element, "material", name="_".join(f"{c:g}" for c in WHITE))
+    _add(material, "color", rgba=WHITE)
 
 
 def _add_mesh(

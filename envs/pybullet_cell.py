@@ -51,7 +51,7 @@ class PybulletCell(Cell):
         self.fine = fine
         self._gui = gui
         meshes = panda_meshes() if fine else None
-        self._urdf = write_panda(config.cache_folder, self.gripper, fine, meshes, self.has_arm)
+        self._urdf = write_panda(config.cache_folder, self.gripper, meshes, self.has_arm)
         self.client = pybullet.connect(pybullet.GUI if gui else pybullet.DIRECT)
         try:
             renderer = load_renderer(self.client, config.sim.renderer)

@@ -88,9 +88,9 @@ class Hand(ABC):
     def encoder_pose(self) -> np.ndarray:
         """(4, 4) T_WE by the joints' positions."""
 
-    @abstractmethod
     def closing_direction(self) -> np.ndarray:
         """(3,) unit vector in W along E's y axis, from the right finger to the left one."""
+        return self.tip_pose()[:3, 1]
 
     # --- Latency ------------------------------------------------------------------------------
 

@@ -1,9 +1,8 @@
 """The simulators, by the names that the config's keys `simulator` and `scene.simulator` take.
 
 A new simulator brings a `Cell` and a `Camera` (`envs.cell`), a `Robot` (`envs.robot`), a
-`LayoutTable` (`envs.cell_layout`), and an entry here. It can be randomised if its cell implements
-`randomizable`. Its modules are imported when they are first asked for, so that a machine needs the
-package of the simulator that it uses, and of no other.
+`LayoutTable` (`envs.cell_layout`), and an entry here. Its modules are imported when they are first
+asked for, so that a machine needs the package of the simulator that it uses, and of no other.
 """
 
 from __future__ import annotations
@@ -15,7 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from envs.cell import Cell, not_randomizable, require_arm
+from envs.cell import Cell, require_arm
 from envs.cell_layout import Box, LayoutTable, ObjectModel
 from utils.config import Config
 from utils.domain_randomization import DomainRandomizer
@@ -113,12 +112,11 @@ def make_layout_table(
 
 
 def check_simulator(config: Config) -> None:
-    """Raise UserError for a simulator that does not exist, is not installed, or cannot be
-    randomised, and for settings that the robot's form rules out."""
-    cell, layouts = cell_class(config.simulator), config.scene.simulator
+    """Raise UserError for a simulator that does not exist or is not installed, and for settings
+    that the robot's form rules out."""
+    cell_class(config.simulator)
+    layouts = config.scene.simulator
     _simulator(layouts, "scene.simulator").check_installed(layouts, "scene.simulator")
-    if config.evaluate.randomise and not cell.can_be_randomized():
-        raise not_randomizable(config)
     if config.evaluate.randomise:
         require_arm(config, "evaluate.randomise=true")
     if config.camera.mount == "wrist":

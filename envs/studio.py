@@ -27,7 +27,7 @@ from typing_extensions import Self
 
 from envs.cell import Cell, Intrinsics
 from envs.cell_scenes import LAYOUTS, make_scene
-from envs.objects import load_object_set
+from envs.objects import load_objects
 from envs.simulators import make_cell
 from utils.atomic_files import check_writable, command_line, new_folder, write_atomic
 from utils.errors import UserError
@@ -210,10 +210,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     with_image = chosen.rgbd is not None and chosen.output is None
     output = chosen.output or (chosen.rgbd or Path()) / SCENE
     check_files(None if with_image else output, chosen.rgbd)
-    objects = load_object_set(
-        chosen.objects, cache_dir=config.cache_folder, max_opening=config.gripper.max_opening,
-        **config.objects.model_dump(),
-    )  # fmt: skip
+    objects = load_objects(chosen.objects, config)
     command = None
     with make_cell(config) as cell:
         cell.load(make_scene(chosen.layout, objects, config.seed, config))

@@ -29,8 +29,7 @@ from gymnasium import spaces
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
 from tqdm import tqdm
 
-from envs.evaluation_worker import load_objects
-from envs.objects import is_folder
+from envs.objects import is_folder, load_objects
 from utils.config import YAML_ERRORS, Config, load_yaml
 from utils.config_schema import EnvConfig
 from utils.errors import UserError, one_line

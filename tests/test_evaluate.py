@@ -17,7 +17,7 @@ import trimesh
 import evaluate
 import utils.runs
 from envs.cell_scenes import make_scene
-from envs.evaluation_worker import load_objects
+from envs.objects import load_objects
 from envs.pybullet_files import data_folder
 from envs.rounds import run_round
 from envs.simulators import make_cell

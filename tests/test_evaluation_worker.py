@@ -5,8 +5,13 @@ import contextlib
 import pytest
 
 from envs.cell import camera_intrinsics
-from envs.evaluation_worker import check_everything, film_name, privileged_policies, work
-from envs.views import check_sees_workspace
+from envs.evaluation_worker import (
+    check_everything,
+    check_sees_workspace,
+    film_name,
+    privileged_policies,
+    work,
+)
 from tests.helpers.records import ROUNDS
 from utils.config import Config, load_config, with_settings
 from utils.errors import UserError

@@ -17,7 +17,7 @@ from envs.execution import GraspFailure, execute_grasp
 from envs.object_bodies import load_object
 from envs.objects import load_object_set
 from envs.robot import Robot
-from envs.simulators import SIMULATORS, cell_class, check_simulator, make_cell, make_layout_table
+from envs.simulators import SIMULATORS, check_simulator, make_cell, make_layout_table
 from models.planners import make_planner
 from tests.helpers.simulators import INSTALLED, move
 from utils.config import load_config
@@ -185,12 +185,6 @@ def test_a_simulator_that_is_not_installed_is_refused(name, monkeypatch):
         mixed = load_config(None, [f"simulator={other}", f"scene.simulator={name}"])
         with pytest.raises(UserError, match=f"scene.{message}.*use scene.simulator={other}"):
             check_simulator(mixed)
-
-
-def test_a_simulator_without_randomisation_is_refused(monkeypatch):
-    monkeypatch.setattr(cell_class(INSTALLED[0]), "randomizable", Cell.randomizable)
-    with pytest.raises(UserError, match="its cell cannot be randomised"):
-        check_simulator(load_config(None, ["evaluate.randomise=true"]))
 
 
 def test_a_body_tumbles_alike_however_it_lies_in_its_file(taught_cell, tmp_path):

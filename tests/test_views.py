@@ -6,10 +6,9 @@ import shlex
 import numpy as np
 import pytest
 
-from envs.cell_layout import Placement, Scene
+from envs.cell_layout import Placement, Scene, side_view
 from envs.objects import load_object_set
 from envs.simulators import make_cell
-from envs.views import side_view
 from utils.config import load_config
 from utils.errors import UserError
 from utils.runs import REPOSITORY

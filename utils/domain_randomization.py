@@ -69,8 +69,7 @@ class RandomizableCell(Protocol):
     sample: dict[str, Any] | None
 
     def randomizable(self) -> Randomizable:
-        """The scene as built: the same object until the cell is built again. Raises UserError in a
-        simulator that cannot be randomised."""
+        """The scene as built: the same object until the cell is built again."""
 
 
 _Parameters = dict[str, tuple[Literal["scale", "add", "set"], float | list[float]]]

@@ -25,7 +25,7 @@ class Stream(IntEnum):
     # [seed, number of the attempt from 1, stream]
     MOTION = 7  # objects that move (`envs.scenarios`)
     # [seed, stream]
-    SIDE_VIEW = 11  # the pose of a camera at the side (`envs.views`)
+    SIDE_VIEW = 11  # the pose of a camera at the side (`envs.cell_layout.side_view`)
     APPEARANCE = 13  # a randomised scene (`envs.simulators`)
     TRACKED_MOTION = 15  # of an object that is tracked (`benchmarks.bench_tracking`)
     PLANNER = 17  # `planner_seed`
