@@ -132,7 +132,8 @@ def main(argv: Sequence[str] | None = None) -> int:
                 if config.rl.env_id in OWN_ENVS:
                     print("its score on other scenes:")
                     print(f"  {scoring_command(config, run, ppo.layout, KNOWN_TO_A_ROBOT)}")
-                film(config, run)
+                if finished:
+                    film(config, run)
             if processes.is_main and not finished:
                 print(stopped_in_words(run, config, ppo.updates, history, options.weights))
     return 0 if finished else 130

@@ -172,8 +172,8 @@ def mostly_table(frame: RGBDFrame, table_height: float) -> bool:
 
 
 def around_matter(frame: RGBDFrame, table_height: float) -> RGBDFrame:
-    """The part of a frame in which something stands on the table, or may stand unseen: all that is
-    left out is table. The whole frame where nothing does."""
+    """The part of a frame in which something stands on the table, higher than `TABLE_FLATNESS` and
+    broader than two pixels, or may stand unseen. The whole frame where nothing does."""
     high = frame.depth < depth_of_plane(frame, table_height + TABLE_FLATNESS)
     high |= ~known_depth(frame.depth)
     # Single pixels are noise.

@@ -131,7 +131,8 @@ class GraspNetPlanner(WithCritic, SearchPlanner):
 
     def of_corrected(self, frame: RGBDFrame) -> list[Grasp]:
         """The grasps in a frame that is corrected by its table (`utils.depth_correction`)."""
-        seen = NetworkView(self.network, frame, self.workspace, crop=True)
+        # A target may be as low as what the crop takes for table.
+        seen = NetworkView(self.network, frame, self.workspace, crop=frame.target is None)
         heights = only_target(seen.heights, frame)
         if len(heights.centres) == 0:  # table and walls alone
             return []

@@ -373,6 +373,8 @@ def test_the_configs_noise_is_checked_by_name_and_arguments():
     assert load_config(None, changed_keys(config)) == config and hash(config)
     with pytest.raises(UserError, match=r"camera.depth_noise_args: 'kinect'.*nois"):
         check_names(load_config(None, [chosen[0], "camera.depth_noise_args={nois: 0.3}"]))
+    with pytest.raises(ConfigError, match="depth_noise_args would be ignored"):
+        load_config(None, ["camera.depth_noise_args={noise: 0.3}"])
     with pytest.raises(ConfigError, match=r"camera.depth_noise_args: got 3 .*expected"):
         load_config(None, ["camera.depth_noise_args=3"])
 

@@ -176,6 +176,16 @@ def test_restore_brings_the_nominal_cell_back(cell, scene):
     assert states(cell) == moved
 
 
+def test_a_randomizer_restores_its_own_changes_alone(cell):
+    own, other = randomizer_of(cell), randomizer_of(cell)
+    own.randomize(0)
+    changed, sample, view = everything(cell)[:4], own.sample, cell.view
+    assert (other.act(np.full(7, 0.5)) == 0.5).all()
+    other.restore()
+    assert everything(cell)[:4] == changed
+    assert own.sample is sample and cell.view is view
+
+
 def test_restore_spares_what_was_retired(cell):
     randomizer = randomizer_of(cell)
     randomizer.randomize(0)

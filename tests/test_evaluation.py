@@ -116,7 +116,6 @@ def test_parameters_belong_to_the_camera_s_own_noise():
     [
         (["camera.depth_noise=kinect"], "camera.depth_noise=kinect would be ignored: evaluate"),
         (["camera.depth_noise=none"], "camera.depth_noise=none would be ignored"),
-        (["camera.depth_noise_args={noise: 0.3}"], "camera.depth_noise_args would be ignored"),
     ],
 )
 def test_a_noise_that_would_be_ignored_is_refused(overrides, message):

@@ -46,6 +46,14 @@ def test_a_free_target_is_grasped_as_the_planner_would() -> None:
     assert all(is_of(grasp, FLAT) for grasp in grasps)
 
 
+@pytest.mark.parametrize("name", ["heuristic", "graspnet"])
+def test_a_low_target_is_found_beside_something_high(name: str) -> None:
+    """A ruler of 5.2 mm, lower than what GraspNet takes for table where it looks for a pile."""
+    ruler, mug = ((0.02, 0.10, 0.0052), 0.0, (0.43, -0.10)), ((0.06, 0.06, 0.08), 0.3, (0.55, 0.10))
+    grasps = plan_for(name)(frame_of([ruler, mug], ruler))
+    assert grasps and all(is_of(grasp, ruler) for grasp in grasps)
+
+
 def test_a_planner_keeps_its_own_order_of_the_targets_grasps() -> None:
     """As one does that prefers steep approaches to likelier ones."""
 

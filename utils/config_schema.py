@@ -139,6 +139,15 @@ class CameraConfig(Section):
                 )
         return self
 
+    @model_validator(mode="after")
+    def _arguments_of_a_noise(self) -> CameraConfig:
+        if self.depth_noise_args and self.depth_noise == "none":
+            raise ValueError(
+                "depth_noise_args would be ignored: they are the parameters of camera.depth_noise, "
+                "which is none; set that, too"
+            )
+        return self
+
     def make_noise(self, image_focal: float) -> DepthNoise | None:
         """The depth noise of a camera whose focal length is image_focal pixels; None for none."""
         return make_depth_noise(self.depth_noise, image_focal, self.depth_noise_args)

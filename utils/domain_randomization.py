@@ -188,6 +188,8 @@ class DomainRandomizer:
     def restore(self) -> None:
         """Bring the nominal cell back; the objects stay where they are. A scene that was built
         since is nominal already."""
+        if self._scene is None:  # what another randomizer changed is its own to restore
+            return
         if self.sample is not None and self._scene is self._cell.randomizable():
             self._scene.apply({})
             self._scene.paint(None)
@@ -199,7 +201,7 @@ class DomainRandomizer:
 
         Begins a new step: what is drawn at each step changes now.
         """
-        if self.sample is None:
+        if self.sample is None or self._scene is None:
             return action
         changes = self._changes("physics", self._steps, _PHYSICS_STREAM)
         if self.sample["each_step"]["physics"]:

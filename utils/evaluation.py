@@ -205,8 +205,7 @@ def check_controllers(config: Config, overrides: Sequence[str] = ()) -> None:
 
 
 def check_depth_noises(config: Config, overrides: Sequence[str] = ()) -> None:
-    """Raise UserError for a camera.depth_noise that evaluate.depth_noises leaves out, and for
-    parameters that belong to none of its noises."""
+    """Raise UserError for a camera.depth_noise that evaluate.depth_noises leaves out."""
     several, camera = config.evaluate.depth_noises, config.camera
     if several is None:
         return
@@ -216,11 +215,6 @@ def check_depth_noises(config: Config, overrides: Sequence[str] = ()) -> None:
             f"camera.depth_noise={camera.depth_noise} would be ignored: evaluate.depth_noises is "
             f"[{', '.join(several)}] and says with which noises policies are scored; set one of "
             "the two keys"
-        )
-    if camera.depth_noise_args and camera.depth_noise == CLEAN:
-        raise UserError(
-            "camera.depth_noise_args would be ignored: they are the parameters of "
-            f"camera.depth_noise, which is {CLEAN}; set that, too"
         )
 
 
