@@ -121,13 +121,6 @@ class GraspPPO:
                 [self.estimator_weights], settings.estimate_lr, fused=True
             )
 
-    def action(self, observation: Any) -> np.ndarray:
-        """(A,) the deterministic action for one observation of one environment."""
-        seen = self.layout.read_one(observation).map(lambda part: part.to(self.team.device))
-        with torch.inference_mode():
-            latent = self.network(seen.image(), seen.state).mean
-            return self.network.action(latent)[0].cpu().numpy()
-
     # --- An update ------------------------------------------------------------------------------
 
     def update(self, rollout: Rollout, progress: float = 0.0) -> dict[str, float]:
