@@ -20,7 +20,8 @@ from envs.cell_layout import EMPTY, TRAY_HEIGHT, Box, Scene, on_table, side_view
 from envs.robot import Robot
 from envs.robot_kinematics import JOINT_LOWER, JOINT_UPPER, tip_position
 from envs.robot_safety import ArmGate
-from utils.config import CameraConfig, Config
+from utils.config import Config
+from utils.config_schema import CameraConfig
 from utils.config_types import changed_in
 from utils.depth import seeded_noise
 from utils.domain_randomization import Randomizable

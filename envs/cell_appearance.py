@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from envs.cell import TABLE_OR_BACKGROUND, Cell, Intrinsics, camera_intrinsics
-from utils.config import CameraConfig
+from utils.config_schema import CameraConfig
 from utils.random_view import Texture, random_colour
 from utils.transforms import RGBDFrame, known_depth, look_at
 

@@ -20,7 +20,8 @@ from typing_extensions import Self
 
 from envs.object_files import FineVisual
 from envs.object_shapes import NativeShape
-from utils.config import CameraConfig, Config, WorkspaceConfig
+from utils.config import Config
+from utils.config_schema import CameraConfig, WorkspaceConfig
 from utils.geometry import TRAY_CENTRE, TRAY_HALF_SIZE, TRAY_WALL, ConvexSolid
 from utils.random_streams import Stream
 from utils.transforms import look_at

@@ -37,7 +37,8 @@ from models.planners import (
     needs_truth,
     tilts,
 )
-from utils.config import CameraConfig, Config, WorkspaceConfig
+from utils.config import Config
+from utils.config_schema import CameraConfig, WorkspaceConfig
 from utils.errors import UserError
 from utils.evaluation import FilmFile, Task, TaskResult, policies_of, with_depth_noise
 from utils.executor import open_executor

@@ -20,7 +20,7 @@ from envs.panda_model import FINGERS, floating_links
 from envs.robot import Hand
 from envs.robot_kinematics import HAND_ACCELERATION, HAND_JERK
 from envs.robot_motion import SCurve
-from utils.config import WorkspaceConfig
+from utils.config_schema import WorkspaceConfig
 from utils.geometry import ConvexSolid, GripperGeometry
 from utils.transforms import inverse_pose, top_down_pose, transform_points
 

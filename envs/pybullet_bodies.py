@@ -35,7 +35,8 @@ from envs.cell_layout import (
 )
 from envs.object_files import FineVisual
 from envs.object_shapes import NativeShape
-from utils.config import Config, SimConfig
+from utils.config import Config
+from utils.config_schema import SimConfig
 from utils.transforms import position_quaternion
 
 # (rad/s)^2 or (m/s)^2: the solver stops before its last iteration where no velocity changes by more

@@ -32,7 +32,7 @@ from envs.robot_kinematics import (
     geometric_jacobian,
     tip_position,
 )
-from utils.config import RobotConfig, SafetyConfig
+from utils.config_schema import RobotConfig, SafetyConfig
 from utils.errors import ServoError
 
 _LEAST_SHARE = 0.01  # of a desired velocity: where a limit leaves less, the arm stops

@@ -11,7 +11,7 @@ import numpy as np
 
 from envs.cell import Cell
 from envs.robot_safety import ArmStoppedError, SafetyGate
-from utils.config import SafetyConfig
+from utils.config_schema import SafetyConfig
 
 _MAX_LAG = 0.05  # rad by which the commanded joint positions may be ahead of the true ones
 _REST_SECONDS = 0.1  # for the arm to come to rest after the last command

@@ -16,7 +16,8 @@ from typing import NamedTuple
 from envs.policy_approach import check_learned, is_learned
 from models.photographs import HAND, judge_as_taken, judge_photographs
 from models.rectangle_examples import JudgedRectangle, draw_rectangles
-from utils.config import Config, TransferPolicy, with_settings
+from utils.config import Config, with_settings
+from utils.config_schema import TransferPolicy
 from utils.errors import UserError, unknown_choice
 from utils.evaluation import depth_noises_of, policies_of
 from utils.rectangles import RealSample

@@ -45,7 +45,8 @@ from utils.adaptation import (
 from utils.atomic_files import write_atomic
 from utils.augmentation import Augmentation, ColourJitter, LabelledImages
 from utils.checkpoint import load_weights
-from utils.config import AdaptationConfig, Config, TrainConfig
+from utils.config import Config
+from utils.config_schema import AdaptationConfig, TrainConfig
 from utils.distributed import Team
 from utils.errors import UserError
 from utils.grasp_labels import ANGLE_BINS

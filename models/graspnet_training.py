@@ -26,7 +26,8 @@ from utils.checkpoint import (
     rng_states,
     save_checkpoint,
 )
-from utils.config import Config, TrainConfig
+from utils.config import Config
+from utils.config_schema import TrainConfig
 from utils.distributed import Team
 from utils.errors import UserError
 

@@ -7,7 +7,7 @@ import imageio.v3 as iio
 import numpy as np
 import pytest
 
-from utils.config import TransferPolicy
+from utils.config_schema import TransferPolicy
 from utils.result_records import AttemptRecord, RoundRecord
 from utils.statistics import clustered_interval, wilson_interval
 from utils.transfer import (

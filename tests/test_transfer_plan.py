@@ -21,7 +21,8 @@ from envs.transfer_plan import (
     score_photographs,
 )
 from models.rectangle_examples import JudgedRectangle
-from utils.config import Config, TransferPolicy, load_config
+from utils.config import Config, load_config
+from utils.config_schema import TransferPolicy
 from utils.errors import UserError
 from utils.evaluation import Outcome, depth_noises_of
 from utils.rectangles import GraspRectangle

@@ -19,50 +19,15 @@ from typing import Any, NamedTuple
 import yaml
 from pydantic import ValidationError
 
-from utils.config_schema import (
-    AdaptationConfig,
-    CameraConfig,
-    ClosedLoopConfig,
-    ComputeConfig,
-    Config,
-    EnvConfig,
-    EvaluateConfig,
-    ExecutionConfig,
-    ObjectsConfig,
-    RobotConfig,
-    SafetyConfig,
-    SceneConfig,
-    ServoConfig,
-    SimConfig,
-    TrainConfig,
-    TransferPolicy,
-    WorkspaceConfig,
-)
-from utils.config_types import RandomizationConfig, Section
+from utils.config_schema import Config
+from utils.config_types import Section
 from utils.errors import UserError, did_you_mean, one_line
 from utils.plugins import code_named_in
 
 __all__ = [
     "DEFAULTS",
-    "AdaptationConfig",
-    "CameraConfig",
-    "ComputeConfig",
     "Config",
     "ConfigError",
-    "EnvConfig",
-    "EvaluateConfig",
-    "ExecutionConfig",
-    "ClosedLoopConfig",
-    "ObjectsConfig",
-    "RandomizationConfig",
-    "RobotConfig",
-    "SafetyConfig",
-    "SceneConfig",
-    "ServoConfig",
-    "SimConfig",
-    "TrainConfig",
-    "TransferPolicy",
-    "WorkspaceConfig",
     "changed_keys",
     "dump_config",
     "load_config",

@@ -14,7 +14,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from utils.atomic_files import write_atomic
-from utils.config import Config, TransferPolicy
+from utils.config import Config
+from utils.config_schema import TransferPolicy
 from utils.result_formats import aligned, share_in_words
 from utils.result_records import RoundRecord
 from utils.runs import save_results
