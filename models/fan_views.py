@@ -20,6 +20,7 @@ import torch.nn.functional as F
 from utils.depth_holes import depth_of_plane
 from utils.height_map import LABEL_FLOOR, OTHER_LABEL, RIM, HeightMap
 from utils.seen_heights import (
+    ABOVE_RAYS,
     BORROWED_WITHIN,
     FARTHEST,
     GRAZING_JUMP,
@@ -145,7 +146,10 @@ def fan_views(
     lowest = -highest_within(-torch.where(hidden, torch.inf, seen), int(BORROWED_WITHIN / cell))
     borrowed = torch.where(lowest.isfinite(), lowest, slope)
     height = torch.maximum(torch.where(hidden, borrowed, seen), slope)
-    ceiling = torch.maximum(draw.grazing(filled.depth), height)
+    grazed = draw.grazing(filled.depth)
+    above = hidden & grazed.isfinite() & (height > grazed + ABOVE_RAYS)
+    height = torch.where(above, slope, height)
+    ceiling = torch.maximum(grazed, height)
     upright = (frames[:, 2, 2] == 1.0)[:, None, None]
     ceiling = torch.where(upright & ~hidden, height, ceiling)
     if hiding.any():

@@ -60,5 +60,6 @@ def run_network(
     device = next(model.parameters()).device
     if model.training:  # eval() walks through all modules
         model.eval()
-    maps = model(image[None].to(device), centres=centres)
+    batch = image[None].to(device, memory_format=torch.channels_last)  # quickest on CPUs
+    maps = model(batch, centres=centres)
     return tuple(part.float().cpu() for part in maps)

@@ -42,6 +42,7 @@ from utils.transforms import (
 
 BLUR = 1.0  # pixels, standard deviation of the Gaussian over the quality
 CROP_MARGIN = 0.04  # m around what stands on the table
+_LEAST_PIECE = 9  # connected pixels: a piece of fewer is noise, however thin a larger one is
 LEAST_QUALITY = 0.02  # so that grasps which fit are ranked where the network sees none
 
 
@@ -172,15 +173,17 @@ def mostly_table(frame: RGBDFrame, table_height: float) -> bool:
 
 
 def around_matter(frame: RGBDFrame, table_height: float) -> RGBDFrame:
-    """The part of a frame in which something stands on the table, higher than `TABLE_FLATNESS` and
-    broader than two pixels, or may stand unseen. The whole frame where nothing does."""
+    """The part of a frame in which something stands on the table, higher than `TABLE_FLATNESS`, or
+    may stand unseen. The whole frame where nothing does."""
     high = frame.depth < depth_of_plane(frame, table_height + TABLE_FLATNESS)
-    high |= ~known_depth(frame.depth)
-    # Single pixels are noise.
-    pieces = cv2.morphologyEx(high.astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
-    left, top, width, height = cv2.boundingRect(pieces)
-    if width == 0:
+    high = (high | ~known_depth(frame.depth)).astype(np.uint8)
+    _, _, stats, _ = cv2.connectedComponentsWithStats(high, connectivity=4)
+    kept = stats[1:][stats[1:, cv2.CC_STAT_AREA] >= _LEAST_PIECE]  # the first is the table
+    if len(kept) == 0:
         return frame
+    left, top = kept[:, [cv2.CC_STAT_LEFT, cv2.CC_STAT_TOP]].min(axis=0)
+    ends = kept[:, :2] + kept[:, [cv2.CC_STAT_WIDTH, cv2.CC_STAT_HEIGHT]]
+    width, height = ends.max(axis=0) - (left, top)
     margin = reach_in_pixels(frame, CROP_MARGIN)
     return frame.part(
         slice(max(top - margin, 0), top + height + margin),

@@ -208,6 +208,23 @@ def test_what_is_cut_off_is_table() -> None:
     np.testing.assert_allclose(across, sides, atol=0.015)
 
 
+def test_a_rod_two_pixels_thick_is_not_cut_off() -> None:
+    """3 mm where a pixel spans 1.8 mm; it ends 12 cm from the box beside it."""
+    rod = ((0.12, 0.003, 0.02), 0.0, (0.56, -0.08))
+    part = around_matter(boxes_frame([BOXES[1], rod]), 0.0)
+    points = part.points().reshape(-1, 3)
+    seen = points[points[:, 2] > 0.01]
+    assert seen[:, 0].max() == pytest.approx(0.62, abs=0.003)
+
+
+def test_single_pixels_are_noise() -> None:
+    frame = boxes_frame(BOXES)
+    depth = frame.depth.copy()
+    depth[3:6, 3:5] -= 0.05
+    noisy = around_matter(replace(frame, depth=depth), 0.0)
+    assert noisy.depth.shape == around_matter(frame, 0.0).depth.shape
+
+
 def test_an_empty_table_stays_whole() -> None:
     frame = boxes_frame([])
     assert around_matter(frame, 0.0) is frame

@@ -51,6 +51,7 @@ _CARVED = 2  # cells of height that are carved from a ceiling at once
 STEEPEST = 0.02  # least cosine between a view and the vertical: a table seen along itself is a wall
 FARTHEST = 1.0  # m, a table in a tilted view is no farther from the place about which it is tilted
 BORROWED_WITHIN = 0.02  # m, within which a hidden cell takes the lowest surface
+ABOVE_RAYS = 0.002  # m, by which that surface may be above the rays that graze an edge
 GRAZING_JUMP = 0.006  # m of depth between neighbouring pixels, at which a ray grazes an edge
 # Points on such rays, two for each cell of the longest: as many as 30 cells need at most, and again
 # as many as they need on the longer ones, which a camera at the side sees graze what is high.
@@ -105,10 +106,12 @@ def seen_heights(
     split = subpixels(frame, cell)
     seen = _surface(frame, origin, cell, split, shape)
     hidden = ~np.isfinite(seen)
-    height = _filled(seen, slope, cell)
     # The rays that graze an edge bound the matter in its shadow.
-    ceiling = _grazed(frame, origin, cell, shape)
-    ceiling = np.maximum(ceiling, height)
+    grazed = _grazed(frame, origin, cell, shape)
+    height = _filled(seen, slope, cell)
+    # What was borrowed a short way behind an object may be the top of the object itself.
+    height = np.where(hidden & np.isfinite(grazed) & (height > grazed + ABOVE_RAYS), slope, height)
+    ceiling = np.maximum(grazed, height)
     if T_WV[2, 2] == 1.0:  # a camera above has seen what is over a surface that it sees
         ceiling = np.where(hidden, ceiling, height)
     if hiding.any():
@@ -139,7 +142,9 @@ def with_second(first: SeenHeights, second: RGBDFrame) -> SeenHeights:
     split = subpixels(second, cell)
     also = _surface(second, first.origin, cell, split, shape)
     seen = np.maximum(np.where(first.hidden, -np.inf, first.height), also)
-    height, hidden = _filled(seen, first.slope, cell), ~np.isfinite(seen)
+    hidden = ~np.isfinite(seen)
+    height = _filled(seen, first.slope, cell)
+    height = np.where(hidden, np.minimum(height, first.height), height)
     ceiling = _carved(np.maximum(first.ceiling, height), height, second, first.origin, cell)
     # As near a surface as this, the cameras' disagreement is all that is left of it.
     just = ~hidden & (ceiling < height + 2 * _SEEN_THROUGH + _CARVED * cell)
