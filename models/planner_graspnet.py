@@ -189,9 +189,9 @@ def fitted_peaks(
     """Measured candidates at the peaks of a network's quality, scored as the search does."""
     value = partial(seen.value, heights)
     rough = _at_points(seen.peaks(PEAKS), heights, gripper, workspace, settings)
-    rough = replace(rough, score=value(rough)).best(settings.shortlist)
+    rough = replace(rough, score=value(rough))
     for margins in (settings, settings.relaxed(), settings.off_centre()):
-        deep = _at_depths(rough, workspace.table_height, margins)
+        deep = _at_depths(rough.best(margins.shortlist), workspace.table_height, margins)
         found = measure(deep, heights, gripper, margins, len(DEPTH_STEPS)).best(margins.finalists)
         found = without_bumps(found, heights, gripper)
         if len(found):
