@@ -44,19 +44,18 @@ def test_the_open_volume_is_that_of_the_shadow() -> None:
     near, far = slabs[0].max(axis=1), slabs[1].min(axis=1)
     shadow = ~inside & (near < far) & (far > 0) & (near < 1)
     volume = shadow.mean() * np.prod(high - low)
-    # The map takes the box to be 2 cm longer than what is seen of it.
-    longer = 0.02 * BOX[0][1] * BOX[0][2]
-    assert 0.8 * (volume - longer) < open_space(0).volume < volume
+    assert open_space(0).volume == pytest.approx(volume, rel=0.05)
     assert open_space(0, 180).volume < 0.1 * volume
 
 
 @pytest.mark.parametrize("azimuth", [0, 90, -120])
 def test_the_best_view_is_from_the_other_side(azimuth: float) -> None:
     space = open_space(azimuth)
-    shown = [space.shown(K, SHAPE, T_WC) for T_WC in dome(Workspace())]
-    opposite = azimuth_of(dome(Workspace())[int(np.argmax(shown))]) - azimuth - 180
-    assert abs((opposite + 180) % 360 - 180) <= 31
-    assert max(shown) > 0.85 * space.volume
+    shown = np.array([space.shown(K, SHAPE, T_WC) for T_WC in dome(Workspace())])
+    off = np.array([azimuth_of(T_WC) - azimuth for T_WC in dome(Workspace())]) % 360 - 180
+    assert abs(off[shown.argmax()]) < 90
+    # Past a box as narrow as this one, views from farther aside show as much.
+    assert shown[abs(off) <= 31].max() > 0.97 * shown.max() > 0.97 * 0.95 * space.volume
     assert space.shown(K, SHAPE, from_side(azimuth)) < 0.05 * space.volume  # whence it is hidden
 
 
