@@ -63,7 +63,8 @@ SUBPIXELS = 2  # points along each side of the square that a pixel stands for, a
 class SeenHeights:
     """What a frame tells about the cells (R, C) of a grid in V; metres in V, without walls.
 
-    height: the highest surface seen; hidden cells hold the lowest one nearby. ceiling: the highest
+    height: the highest surface seen; hidden cells hold the lowest one nearby, or the table where no
+    matter can reach up to it. ceiling: the highest
     that matter could reach which was hidden or not measured; equals `height` where there is none.
     hidden: bool, cells in which no surface was seen. unknown: bool, cells of which not even the
     surroundings are known. slope: the table. origin, cell: the grid, as of `HeightMap`. T_WV:
@@ -144,6 +145,7 @@ def with_second(first: SeenHeights, second: RGBDFrame) -> SeenHeights:
     seen = np.maximum(np.where(first.hidden, -np.inf, first.height), also)
     hidden = ~np.isfinite(seen)
     height = _filled(seen, first.slope, cell)
+    # A second surface nearby is no reason for more matter in what both cameras leave hidden.
     height = np.where(hidden, np.minimum(height, first.height), height)
     ceiling = _carved(np.maximum(first.ceiling, height), height, second, first.origin, cell)
     # As near a surface as this, the cameras' disagreement is all that is left of it.
