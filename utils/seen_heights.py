@@ -64,8 +64,8 @@ class SeenHeights:
     """What a frame tells about the cells (R, C) of a grid in V; metres in V, without walls.
 
     height: the highest surface seen; hidden cells hold the lowest one nearby, or the table where no
-    matter can reach up to it. ceiling: the highest
-    that matter could reach which was hidden or not measured; equals `height` where there is none.
+    matter can reach up to it. ceiling: the highest that matter could reach which was hidden or not
+    measured; equals `height` where there is none.
     hidden: bool, cells in which no surface was seen. unknown: bool, cells of which not even the
     surroundings are known. slope: the table. origin, cell: the grid, as of `HeightMap`. T_WV:
     (4, 4) the grid's frame in W.
