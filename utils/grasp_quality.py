@@ -47,8 +47,8 @@ class LabelSettings:
     """Margins and scales of grasp quality; metres and radians unless said.
 
     The defaults were chosen by executing labelled grasps on training scenes, which
-    `python -m benchmarks.bench_labels` repeats: of quality `positive` and above, 95 % and more
-    succeed. The depth is a compromise: deeper grips better, shallower reaches more of a pile (at
+    `python -m benchmarks.bench_labels` repeats: of quality `positive` and above, 93 % succeed
+    (docs/graspnet.md). The depth is a compromise: deeper grips better, shallower reaches more of a pile (at
     2 cm 76 of 84 objects in 20 scenes have a feasible grasp; at 1.5 cm 77, at 2.5 cm 73).
     """
 
