@@ -48,8 +48,8 @@ class LabelSettings:
 
     The defaults were chosen by executing labelled grasps on training scenes, which
     `python -m benchmarks.bench_labels` repeats: of quality `positive` and above, 93 % succeed
-    (docs/graspnet.md). The depth is a compromise: deeper grips better, shallower reaches more of a pile (at
-    2 cm 76 of 84 objects in 20 scenes have a feasible grasp; at 1.5 cm 77, at 2.5 cm 73).
+    (docs/graspnet.md). The depth is a compromise: deeper grips better, shallower reaches more of a
+    pile (at 2 cm 76 of 84 objects in 20 scenes have a feasible grasp; at 1.5 cm 77, at 2.5 cm 73).
     """
 
     depth: float = 0.020  # fingertips below the visible surface, where the table leaves room
