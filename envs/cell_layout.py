@@ -1,4 +1,5 @@
-"""What stands in a cell, as data: gravity, table, tray, walls, objects, and the scene of a round.
+"""What stands in a cell, as data: gravity, table, tray, walls, objects, the scene of a round, and
+the views from the side that its seed draws.
 
 Every simulator builds its cell from these constants and from a `Scene`, and implements the
 `LayoutTable` on which objects come to rest. `envs.objects` makes the objects, `envs.cell_scenes`
